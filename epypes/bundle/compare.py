@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from epypes.wire.encoder import set_sort_key
@@ -40,15 +40,15 @@ class Tolerance:
 
 
 @dataclass(frozen=True, slots=True)
-class Unlike:
-    """One number, text or array that is not what was expected.
+class Difference:
+    """A number, text or array that is not what was expected; or all of a token's, at the first of them.
 
     Attributes
     ----------
-    where
-        The indices and keys that lead to it, and into it: ``[2]['size']``, ``[17, 4]``.
     text
-        What differs, with the values.
+        What differs, with the first index and both values.
+    index
+        The indices and keys that lead to it, and into it: ``[2]['size']``, ``[17, 4]``.
     expected, got
         The first values that differ, as text.
     count, size
@@ -56,72 +56,35 @@ class Unlike:
     largest
         The largest difference; None if they are no numbers.
     relative
-        The largest difference of a number as a part of its magnitude, see Tolerance; 0.0 for what is no floating-point
-        number.
-    epsilon
-        The distance of neighbouring numbers at 1.0, if these are floating-point numbers that differ as such: no NaN or
-        infinity has come or gone. 0.0 for everything else.
-    """
-
-    where: str
-    text: str
-    expected: str
-    got: str
-    count: int = 1
-    size: int = 1
-    largest: float | None = None
-    relative: float = 0.0
-    epsilon: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """Where a token first is not what was recorded.
-
-    Attributes
-    ----------
-    sample
-        The sample's name.
-    token
-        The token's.
-    text
-        What differs, with the first index and both values.
-    index
-        The first index, ``""`` for a value that has none.
-    expected, got
-        The values there, as text.
-    count, size
-        How many values of the token differ, of how many.
-    largest
-        The largest difference of numbers, None for what is none.
-    relative
-        The largest difference of a floating-point number as a part of its magnitude, see Tolerance.
+        The largest difference of a floating-point number as a part of its magnitude, see Tolerance; 0.0 for others.
     is_noise
         Whether all that differ are floating-point numbers, in less than half of their digits.
+    sample, token
+        The names of both; "" where there are none.
     """
 
-    sample: str
-    token: str
     text: str
     index: str = ""
     expected: str = ""
     got: str = ""
-    count: int = 0
-    size: int = 0
+    count: int = 1
+    size: int = 1
     largest: float | None = None
     relative: float = 0.0
     is_noise: bool = False
+    sample: str = ""
+    token: str = ""
 
     def __str__(self) -> str:
-        return f"sample {self.sample}, token {self.token!r}: {self.text}"
+        return f"sample {self.sample}, token {self.token!r}: {self.text}" if self.token else self.text
 
 
 def first_difference(expected: Any, got: Any, tolerance: Tolerance | None = None) -> str | None:
     """Return where two values first differ, as text, or None if they agree in type and to the last bit."""
-    return next((unlike.text for unlike in differences(expected, got, tolerance)), None)
+    return next((found.text for found in differences(expected, got, tolerance)), None)
 
 
-def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, where: str = "") -> Iterator[Unlike]:
+def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, where: str = "") -> Iterator[Difference]:
     """Yield every place where two values differ, in order; none if they agree in type and to the last bit.
 
     Parameters
@@ -143,35 +106,38 @@ def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, whe
         yield from inside(expected, got, tolerance, where)
 
 
-def difference(sample: str, token: str, found: Iterable[Unlike]) -> Difference | None:
+def difference(sample: str, token: str, found: Iterable[Difference]) -> Difference | None:
     """Return the difference of a token of all places where it differs; None if there are none."""
     places = [*found]
     if not places:
         return None
-    first = places[0]
     more = len(places) - 1
-    text = first.text + (f"; {counted(more, 'other place')} of it differ{'s' * (more == 1)}" if more else "")
-    count, size = (sum(getattr(place, name) for place in places) for name in ("count", "size"))
-    numbers = [place.largest for place in places if place.largest is not None]
-    largest = max(numbers, default=None)
-    return Difference(
-        sample, token, text, first.where, first.expected, first.got, count, size, largest,
-        max(place.relative for place in places), is_noise(places),
-    )  # fmt: skip
+    others = f"; {counted(more, 'other place')} of it differ{'s' * (more == 1)}" if more else ""
+    return replace(
+        places[0],
+        text=places[0].text + others,
+        count=sum(place.count for place in places),
+        size=sum(place.size for place in places),
+        largest=max((place.largest for place in places if place.largest is not None), default=None),
+        relative=max(place.relative for place in places),
+        is_noise=is_noise(places),
+        sample=sample,
+        token=token,
+    )
 
 
-def is_noise(found: Iterable[Unlike]) -> bool:
+def is_noise(found: Iterable[Difference]) -> bool:
     """Whether all that differ are floating-point numbers, in less than half of their digits."""
-    return all(unlike.epsilon and unlike.relative <= math.sqrt(unlike.epsilon) for unlike in found)
+    return all(place.is_noise for place in found)
 
 
-def _named(where: str, expected: str, got: str) -> Unlike:
-    return Unlike(where.replace(" ", ""), f"{where}expected {expected}, got {got}", expected, got)
+def _named(where: str, expected: str, got: str) -> Difference:
+    return Difference(f"{where}expected {expected}, got {got}", where.replace(" ", ""), expected, got)
 
 
 def _in_mappings(
     expected: Mapping[Any, Any], got: Mapping[Any, Any], tolerance: Tolerance | None, where: str
-) -> Iterator[Unlike]:
+) -> Iterator[Difference]:
     if _keys(expected) != _keys(got):
         yield _named(where, f"the keys {list(expected)!r:.80}", f"{list(got)!r:.80}")
         return
@@ -184,7 +150,7 @@ def _keys(mapping: Mapping[Any, Any]) -> list[tuple[type, str]]:
     return [(type(key), _described(key)) for key in mapping]
 
 
-def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     if len(expected) != len(got):
         yield _named(where, f"{len(expected)} items", f"{len(got)}")
         return
@@ -192,19 +158,19 @@ def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: s
         yield from differences(left, right, tolerance, f"{where}[{index}] ")
 
 
-def _in_sets(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_sets(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     left, right = ({*map(set_sort_key, items)} for items in (expected, got))
     if left != right:
         yield _named(where, f"{sorted(left - right)!r:.60} in the set", f"{sorted(right - left)!r:.60}")
 
 
-def _in_records(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_records(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     names = FIELDS[record_type(expected)]
     for name, left, right in zip(names, record_fields(expected), record_fields(got), strict=True):
         yield from differences(left, right, tolerance, f"{where}.{name} ")
 
 
-def _in_tables(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_tables(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     left, right = table_parts(expected), table_parts(got)
     ours_at, theirs_at = ([place for place, _ in parts] for parts in (left, right))
     if ours_at != theirs_at:
@@ -214,7 +180,7 @@ def _in_tables(expected: Any, got: Any, tolerance: Tolerance | None, where: str)
         yield from differences(ours, theirs, tolerance, f"{where}{place} ")
 
 
-def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     # repr tells -0.0 from 0.0 and makes NaN agree with itself.
     if repr(expected) == repr(got):
         return
@@ -222,19 +188,21 @@ def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, wh
     is_finite = math.isfinite(largest)
     if is_finite and tolerance and largest <= min(tolerance.absolute, tolerance.relative * magnitude):
         return
-    named = _named(where, repr(expected), repr(got))
-    epsilon = 2.0**-52 if is_finite else 0.0
     relative = largest / magnitude if is_finite and magnitude else math.inf
-    yield Unlike(named.where, named.text, named.expected, named.got, 1, 1, _finite(largest), relative, epsilon)
+    yield replace(
+        _named(where, repr(expected), repr(got)),
+        largest=_finite(largest),
+        relative=relative,
+        is_noise=relative <= _noise(2.0**-52),
+    )
 
 
-def _in_others(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_others(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     left, right = _described(expected), _described(got)
     if left != right:
-        named = _named(where, f"{left:.60}", f"{right:.60}")
         is_integer = type(expected) is int and abs(expected) < 2**1000 > abs(got)
         largest = float(abs(got - expected)) if is_integer else None
-        yield Unlike(named.where, named.text, named.expected, named.got, largest=largest)
+        yield replace(_named(where, f"{left:.60}", f"{right:.60}"), largest=largest)
 
 
 def _described(value: Any) -> str:
@@ -242,7 +210,7 @@ def _described(value: Any) -> str:
     return repr(value) if type(value) in _EXACT else _ADDRESS.sub(r"\g<1>0x", repr(value))
 
 
-_Inside = Callable[[Any, Any, Tolerance | None, str], Iterator[Unlike]]
+_Inside = Callable[[Any, Any, Tolerance | None, str], Iterator[Difference]]
 _INSIDE: Final[tuple[tuple[Callable[[Any], object], _Inside], ...]] = (
     (lambda value: isinstance(value, Mapping), _in_mappings),
     (lambda value: isinstance(value, list | tuple), _in_sequences),
@@ -253,7 +221,7 @@ _INSIDE: Final[tuple[tuple[Callable[[Any], object], _Inside], ...]] = (
 )
 
 
-def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
     import numpy as np
 
     if expected.dtype != got.dtype or expected.shape != got.shape:
@@ -274,7 +242,7 @@ def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str)
         yield _in_elements(left, right, unlike, expected.shape, where, (distance, magnitude, epsilon))
 
 
-def _in_elements(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Unlike:
+def _in_elements(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Difference:
     import numpy as np
 
     distance, magnitude, epsilon = measured
@@ -289,7 +257,9 @@ def _in_elements(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], whe
         with np.errstate(all="ignore"):
             relative = float((distance[unlike] / magnitude[unlike]).max())
     place = where.replace(" ", "") + str(index)
-    return Unlike(place, text, str(left[first]), str(right[first]), count, left.size, largest, relative, epsilon)
+    is_noise = epsilon > 0 and relative <= _noise(epsilon)
+    values = str(left[first]), str(right[first])
+    return Difference(text, place, *values, count, left.size, largest, relative, is_noise)
 
 
 def _distances(left: Any, right: Any) -> tuple[Any, Any, float]:
@@ -311,6 +281,11 @@ def _distances(left: Any, right: Any) -> tuple[Any, Any, float]:
         epsilon = float(np.finfo(left.dtype).eps)
         magnitude = np.maximum(magnitude, FLOOR * math.sqrt(epsilon) * magnitude.max(initial=0.0))
     return distance, magnitude, epsilon if np.isfinite(distance).all() else 0.0
+
+
+def _noise(epsilon: float) -> float:
+    """Return the relative difference up to which less than half of the digits are others."""
+    return math.sqrt(epsilon)
 
 
 def _finite(number: float) -> float | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.clone import clone_graph
 from epypes.bundle.code_snapshot import CodeSnapshot
-from epypes.bundle.compare import Tolerance, Unlike, differences, is_noise
+from epypes.bundle.compare import Difference, Tolerance, differences, is_noise
 from epypes.errors import BundleError, InputMutated
 from epypes.graph import CompGraph, with_defaults
 from epypes.optional import optional_import
@@ -104,7 +104,7 @@ def learn(
         seen = _Seen(runner, sample, lambda text, of=of: on_progress(text + of))  # type: ignore[misc]
         for token, found in seen.unlike.items():
             if token in outputs and is_noise(found) and token not in seen.growing():
-                relative = max(unlike.relative for unlike in found)
+                relative = max(place.relative for place in found)
                 tolerances[token] = widened(tolerances.get(token), _distance(found), relative)
         reason = seen.reason(outputs)
         reasons += [reason] if reason and reason not in reasons else []
@@ -124,7 +124,7 @@ class _Seen:
     def __init__(self, runner: CompGraphRunner, sample: Run, on_progress: OnProgress) -> None:
         self._runner, self._sample, self._on_progress = runner, sample, on_progress
         self._first: Run | None = None
-        self.unlike: dict[str, list[Unlike]] = {}
+        self.unlike: dict[str, list[Difference]] = {}
         # How far each run is from the first of them, by token.
         self._distances: dict[str, list[float]] = {}
         # The tokens in which the runs differ from each other.
@@ -144,8 +144,10 @@ class _Seen:
         except InputMutated as error:
             raise BundleError("", str(error)) from error
         except Exception as error:
+            failure = self._runner.last and self._runner.last.failure
+            where = f"function {failure.function!r}" if failure else "a function"
             text = (
-                f"Run again on the same payload, {run_failed_in(error)} raised {type(error).__name__}: {error}. "
+                f"Run again on the same payload, {where} raised {type(error).__name__}: {error}. "
                 "It keeps something from run to run, or needs what is there once. Make that a token."
             )
             raise BundleError("", text) from error
@@ -188,16 +190,9 @@ class _Seen:
         )
 
 
-def run_failed_in(error: BaseException) -> str:
-    """Return which function raised an error, as the runner's note says it."""
-    notes = "; ".join(getattr(error, "__notes__", ()))
-    start = notes.find("function '")
-    return notes[start:].partition("'")[0] + repr(notes[start:].split("'")[1]) if start >= 0 else "a function"
-
-
-def _distance(found: Sequence[Unlike]) -> float:
+def _distance(found: Sequence[Difference]) -> float:
     """Return how far apart two values are; 0.0 for what is no number."""
-    return max((unlike.largest or 0.0 for unlike in found), default=0.0)
+    return max((place.largest or 0.0 for place in found), default=0.0)
 
 
 def _grows(distances: Sequence[float]) -> bool:

@@ -1,7 +1,8 @@
-"""File access of a bundle while it is replayed: files outside of it, connections and processes.
+"""File access of a bundle while it is replayed: the files outside of it that its functions read.
 
-An audit hook hears of every file that Python opens. Libraries in C open files without it; their names are looked for in
-the text of the module and in the values of hyperparameters.
+A relative path is found by the replay itself, whose working folder is another one. For absolute paths, an audit hook
+hears of every file that Python opens. Libraries in C open files without it; their names are looked for in the text of
+the module and in the values of hyperparameters.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any, Final, Self
 
 _SYSTEM: Final = ("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr")
 _SYSTEM_TOO: Final = ("/System", "/Library", "/var/cache", "/var/lib")
-_NOT_READ: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+_EVENTS: Final = frozenset({"open", "os.listdir", "os.scandir", "sqlite3.connect"})
 _WAY_OUT: Final = (
     "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
     "it into the data of a package that is installed and read it with importlib.resources."
@@ -36,7 +37,7 @@ class Named:
 
 
 class FileAccess:
-    """While its block runs, it is noted what the bundle's functions open, connect to and start.
+    """While its block runs, it is noted which files the bundle's functions open.
 
     Parameters
     ----------
@@ -48,13 +49,12 @@ class FileAccess:
         self._folder = folder
         self._is_on = False
         self._files: dict[str, str] = {}
-        self._notes: dict[str, None] = {}
         self._made: set[str] = set()
 
     def __enter__(self) -> Self:
         self._is_on = True
         sys.addaudithook(self._on_event)  # which can't be taken away again
-        self._before = {named: _state(named.text) for named in named_in(self._folder)}
+        self._before = {named: _state(named.text) for named in _named_in(self._folder)}
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -62,7 +62,9 @@ class FileAccess:
 
     def also_in(self, values: Mapping[str, Any]) -> None:
         """Look for names of files in values of hyperparameters too."""
-        self._before.update({named: _state(named.text) for named in _in_values(values)})
+        for token, value in values.items():
+            named = (Named(text, f"Hyperparameter {token!r} (pipeline.toml)") for text in _texts_in(value))
+            self._before |= {text: _state(text.text) for text in named}
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -78,11 +80,6 @@ class FileAccess:
             found.append(f"{named.what} names {named.text}, which is there. {_WAY_OUT}")
         return tuple(found)
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What else the bundle's functions need of the world, as sentences."""
-        return tuple(self._notes)
-
     def _own_places(self) -> tuple[str, ...]:
         """Return the folders whose files are there wherever the bundle's requirements are."""
         packages = [folder for module in [*sys.modules.values()] for folder in _folders_of(module)]
@@ -95,11 +92,17 @@ class FileAccess:
         )
 
     def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
-        if not self._is_on or event not in _EVENTS:
+        if not self._is_on or event not in _EVENTS or not isinstance(given[0], str | bytes | os.PathLike):
             return
         what = self._function_at_work()
-        if what:
-            _EVENTS[event](self, what, given)
+        if not what:
+            return
+        path = os.path.realpath(os.fsdecode(given[0]))
+        flags = given[2] if event == "open" and isinstance(given[2], int) else 0
+        if flags & os.O_TRUNC or not os.path.exists(path):
+            self._made.add(path)
+        elif not flags & os.O_WRONLY:
+            self._files.setdefault(path, what)
 
     def _function_at_work(self) -> str:
         """Return which function of the bundle is at work; "" if none is, or a module is being imported by it."""
@@ -113,57 +116,24 @@ class FileAccess:
             frame = frame.f_back
         return ""
 
-    def _opened(self, what: str, given: tuple[Any, ...]) -> None:
-        if not isinstance(given[0], str | bytes | os.PathLike):
-            return  # a descriptor, which was opened before
-        path = os.path.realpath(os.fsdecode(given[0]))
-        flags = given[2] if len(given) > 2 and isinstance(given[2], int) else 0
-        if (flags & _NOT_READ and not os.path.exists(path)) or flags & os.O_TRUNC:
-            self._made.add(path)
-        elif os.path.exists(path) and not flags & os.O_WRONLY:
-            self._files.setdefault(path, what)
-
-    def _connected(self, what: str, given: tuple[Any, ...]) -> None:
-        address = given[1]
-        found = ":".join(map(str, address[:2])) if isinstance(address, tuple) else os.fsdecode(address)
-        self._notes[f"{what} connects to {found}."] = None
-
-    def _started(self, what: str, given: tuple[Any, ...]) -> None:
-        arguments = given[1] if len(given) > 1 else given[0]
-        words = [arguments] if isinstance(arguments, str | bytes | os.PathLike) else [*(arguments or ())]
-        self._notes[f"{what} starts {' '.join(map(os.fsdecode, words)):.80}."] = None
-
-
-_EVENTS: Final = {
-    "open": FileAccess._opened,
-    "os.listdir": FileAccess._opened,
-    "os.scandir": FileAccess._opened,
-    "sqlite3.connect": FileAccess._opened,
-    "socket.connect": FileAccess._connected,
-    "subprocess.Popen": FileAccess._started,
-    "os.system": FileAccess._started,
-    "os.posix_spawn": FileAccess._started,
-}
-
 
 def named_here(folder: Path) -> list[str]:
     """Return a sentence for each text of a bundle that names a file in the current folder, which a replay has not."""
-    found = [named for named in named_in(folder, relative=True) if _looks_like_a_file(named.text)]
     return [
         f"{named.what} names {named.text!r}, a file in the current folder here. The current folder is another one "
         f"there. {_WAY_OUT}"
-        for named in found
+        for named in _named_in(folder)
+        if _is_file_here(named.text)
     ]
 
 
-def named_in(folder: Path, *, relative: bool = False) -> list[Named]:
-    """Return the absolute paths, or the texts that may be relative ones, in a bundle's module."""
+def _named_in(folder: Path) -> list[Named]:
+    """Return the texts in a bundle's module, which may name a file."""
     module = folder / "pipeline.py"
     try:
-        tree = ast.parse(module.read_bytes())
+        return [*_texts(ast.parse(module.read_bytes()), "<module>", module.name)]
     except (OSError, SyntaxError, ValueError):
         return []
-    return [named for named in _texts(tree, "<module>", module.name) if os.path.isabs(named.text) != relative]
 
 
 def _texts(node: ast.AST, function: str, file: str) -> Iterator[Named]:
@@ -178,17 +148,12 @@ def _texts(node: ast.AST, function: str, file: str) -> Iterator[Named]:
         yield from _texts(child, child.name if isinstance(child, ast.FunctionDef | ast.ClassDef) else function, file)
 
 
-def _in_values(values: Mapping[str, Any]) -> Iterator[Named]:
-    for token, value in values.items():
-        waiting = [value]
-        while waiting:
-            part = waiting.pop()
-            if isinstance(part, dict):
-                waiting += part.values()
-            elif isinstance(part, tuple | list):
-                waiting += part
-            elif isinstance(part, str) and os.path.isabs(part) and part.isprintable():
-                yield Named(part, f"Hyperparameter {token!r} (pipeline.toml)")
+def _texts_in(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | tuple | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts_in(part)
 
 
 def _place(function: str, file: str, line: int) -> str:
@@ -196,21 +161,22 @@ def _place(function: str, file: str, line: int) -> str:
 
 
 def _state(path: str) -> tuple[int, ...] | None:
-    """Return what changes when a file is written; None for what is not there, and for a folder that all have."""
+    """Return what changes when a file is written; None for what is no file with an absolute path, or that all have."""
     try:
         found = os.stat(path)
     except (OSError, ValueError):
         return None
-    if len(Path(path).parts) < 3 or os.path.realpath(path) == os.path.realpath(tempfile.gettempdir()):
-        return None
-    return found.st_ino, found.st_size, found.st_mtime_ns
+    is_common = len(Path(path).parts) < 3 or os.path.realpath(path) == os.path.realpath(tempfile.gettempdir())
+    return None if is_common or not os.path.isabs(path) else (found.st_ino, found.st_size, found.st_mtime_ns)
 
 
-def _looks_like_a_file(text: str) -> bool:
+def _is_file_here(text: str) -> bool:
+    """Whether a text is the relative path of a file, or of a folder with a slash in its name."""
     try:
-        return bool(text.strip(". /")) and (os.path.isfile(text) or (os.sep in text and os.path.isdir(text)))
+        is_there = os.path.isfile(text) or (os.sep in text and os.path.isdir(text))
     except ValueError:
         return False
+    return is_there and not os.path.isabs(text) and bool(text.strip(". /"))
 
 
 def _folders_of(module: Any) -> list[str]:

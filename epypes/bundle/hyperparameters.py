@@ -242,21 +242,6 @@ def _integer(value: int, depth: int) -> dict[str, Any]:
     return {"value": value} if value in _SMALL else {"value": hex(value), _KIND: "int"}
 
 
-def _float(value: float, depth: int) -> dict[str, Any]:
-    import struct
-
-    if value == value or struct.pack("d", value) == struct.pack("d", float("nan")):
-        return {"value": value}
-    return {"value": struct.pack(">d", value).hex(), _KIND: "nan"}
-
-
-def _read_nan(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> float:
-    import struct
-
-    (value,) = struct.unpack(">d", bytes.fromhex(entry["value"]))
-    return float(value)
-
-
 def _sequence(value: Any, depth: int) -> dict[str, Any]:
     items = [_part(item, depth) for item in value]
     return {"value": items} if type(value) is list else {"value": items, _KIND: type(value).__name__}
@@ -282,20 +267,13 @@ def _array(array: Any) -> dict[str, Any]:
         raise LargeArray(f"an array of {array.size} numbers")
     dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
     numbers = [_of_number(number) for number in array.astype(array.dtype.newbyteorder("=")).reshape(-1)]
-    value = numbers[0] if array.shape == () else _nested(numbers, array.shape)
+    value = np.array(numbers, object).reshape(array.shape).tolist()
     entry = {"value": value, _KIND: "array", "dtype": dtype}
     if array.size == 0:
         entry["shape"] = list(array.shape)
     if np.asarray(read(entry)).tobytes() != array.tobytes():
         raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
     return entry
-
-
-def _nested(numbers: list[Any], shape: tuple[int, ...]) -> list[Any]:
-    if len(shape) <= 1:
-        return numbers
-    stride = len(numbers) // shape[0] if shape[0] else 0
-    return [_nested(numbers[row * stride : (row + 1) * stride], shape[1:]) for row in range(shape[0])]
 
 
 def _read_array(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
@@ -329,7 +307,7 @@ _WRITERS: Final[Mapping[type, Callable[[Any, int], dict[str, Any]]]] = {
     type(None): lambda value, depth: {_KIND: "none"},
     bool: _as_it_is,
     int: _integer,
-    float: _float,
+    float: _as_it_is,
     str: _text,
     complex: lambda value, depth: {"value": [_part(value.real, 0), _part(value.imag, 0)], _KIND: "complex"},
     bytes: lambda value, depth: {"value": value.hex(), _KIND: "bytes"},
@@ -343,7 +321,6 @@ _WRITERS: Final[Mapping[type, Callable[[Any, int], dict[str, Any]]]] = {
 _READERS: Final[Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Any]]] = {
     "none": lambda entry, enums: None,
     "int": lambda entry, enums: int(entry["value"], 16),
-    "nan": _read_nan,
     "complex": lambda entry, enums: complex(*_whole(entry["value"], enums)),
     "bytes": lambda entry, enums: bytes.fromhex(entry["value"]),
     "tuple": lambda entry, enums: tuple(_whole(entry["value"], enums)),

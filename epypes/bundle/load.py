@@ -80,7 +80,8 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
             if not sealed:
                 check_files(folder)
             digest = check_manifest(folder) if sealed else ""
-            settings, source = read_settings(folder / SETTINGS), (folder / MODULE).read_bytes()
+            content, source = (folder / SETTINGS).read_bytes(), (folder / MODULE).read_bytes()
+            settings = read_settings(folder / SETTINGS, content=content)
             stored = read_stored_arrays(folder, settings.hyperparameters)
         except (BundleError, OSError):
             if _identity(folder) == before:
@@ -91,8 +92,8 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
             break
     module = execute(folder / MODULE, source)
     try:
-        enums = getattr(module, "enums", {}) if settings.has_members else {}
-        settings = settings.with_enums(enums)
+        enums = getattr(module, "enums", {})
+        settings = read_settings(folder / SETTINGS, enums, content)
         settings = replace(settings, hyperparameters={**settings.hyperparameters, **stored})
         own = {name: getattr(module, name) for name in settings.own}
         lock_cached_values(vars(module))

@@ -11,15 +11,13 @@ blocks, a device has no end, and a link leads out of the folder.
 from __future__ import annotations
 
 import difflib
-import errno
 import hashlib
-import io
 import os
 import platform
 import stat
 import sys
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -32,7 +30,6 @@ _NEEDED: Final = frozenset({"pipeline.py", "pipeline.toml"})
 # What a comment of the manifest begins with.
 _FACT: Final = "# "
 _LINES: Final = "lines of "
-_WHOLE: Final = "recorded "
 # Bounds on what is read and hashed of a folder that may be anything. Samples and weights are large, text is not.
 MOST_BYTES: Final = 8 * 1024**3
 MOST_FILES: Final = 10_000
@@ -50,7 +47,8 @@ def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -
         What its samples have been recorded on; without, those of the manifest before stay.
     """
     names = _files(folder)
-    facts = _facts(folder) if environment is None else {**environment, **_recorded(folder, names)}
+    facts = dict(recorded_environment(folder) if environment is None else environment)
+    facts |= {f"{_LINES}{name}": _sums(folder / name) for name in names if name in _TEXTS}
     lines = [f"{_FACT}{name}: {value}\n" for name, value in facts.items()]
     lines += [f"{_hash(folder / name)}  {name}\n" for name in names]
     (folder / MANIFEST).write_text("".join(lines), encoding="utf-8")
@@ -74,8 +72,8 @@ def check_manifest(folder: Path) -> str:
     """
     if not os.path.lexists(folder / MANIFEST):
         raise BundleError(folder, _no_bundle(folder))
-    recorded = _read_manifest(folder)
     present = set(_files(folder))
+    recorded = _read_manifest(folder)
     findings = [f"{name} is missing" for name in recorded if name not in present]
     findings += [f"{name} was added" for name in sorted(present - recorded.keys())]
     facts = _facts(folder)
@@ -108,50 +106,29 @@ def why_no_bundle(folder: Path) -> str:
     """
     no_bundle = f"{folder} exists and is not a bundle."
     try:
+        present = _files(folder)
+    except BundleError as error:
+        return str(error)
+    try:
         named = _read_manifest(folder)
     except BundleError:
         return no_bundle
     if not named.keys() >= _NEEDED:
         return no_bundle
-    try:
-        foreign = [name for name in _files(folder, _is_bytecode) if name not in named]
-    except BundleError as error:
-        return str(error)
+    foreign = [name for name in present if name not in named]
+    cached = (path for path in folder.rglob("__pycache__/*") if path.suffix != ".pyc")
+    foreign += [path.relative_to(folder).as_posix() for path in cached]
     return f"{folder} has files that are not the bundle's: {', '.join(foreign):.200}." if foreign else ""
 
 
 def recorded_environment(folder: Path) -> dict[str, str]:
     """Return what the samples of a bundle were recorded on."""
-    return {name: value for name, value in _facts(folder).items() if not name.startswith((_LINES, _WHOLE))}
-
-
-def changed_since_recorded(folder: Path) -> list[str]:
-    """Return as sentences which files, at which line, are not those that the samples were recorded with."""
-    facts = _facts(folder)
-    found = [
-        f"Since the samples were recorded, {name} was changed{_changed_line(folder, name, facts)}."
-        for name in _TEXTS
-        if f"{_LINES}{name}" in facts and (folder / name).is_file() and _sums(folder / name) != facts[_LINES + name]
-    ]
-    samples = {name.removeprefix(_WHOLE): value for name, value in facts.items() if name.startswith(_WHOLE)}
-    found += [
-        f"{name} is not the file that was recorded."
-        for name, value in samples.items()
-        if not (folder / name).is_file() or _hash(folder / name)[:16] != value
-    ]
-    return found
-
-
-def _recorded(folder: Path, names: list[str]) -> dict[str, str]:
-    """Return what stands for each text's lines and for each sample."""
-    lines = {f"{_LINES}{name}": _sums(folder / name) for name in names if name in _TEXTS}
-    whole = {f"{_WHOLE}{name}": _hash(folder / name)[:16] for name in names if name not in _TEXTS}
-    return {**lines, **whole}
+    return {name: value for name, value in _facts(folder).items() if not name.startswith(_LINES)}
 
 
 def _sums(path: Path) -> str:
     """Return four hexadecimal digits for each line: enough to find the one that was changed."""
-    return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in _read(path).splitlines())
+    return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in path.read_bytes().splitlines())
 
 
 def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
@@ -164,7 +141,7 @@ def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
     what, first, _, at, _ = next((change for change in changes if change[0] != "equal"), ("", 0, 0, 0, 0))
     if what == "delete":
         return f", where line {first + 1} is missing"
-    text = [*_read(path).decode(errors="replace").splitlines(), ""][at].strip()
+    text = [*path.read_bytes().decode(errors="replace").splitlines(), ""][at].strip()
     return f" at line {at + 1}: {text:.80}" if what else ""
 
 
@@ -178,7 +155,7 @@ def _no_bundle(folder: Path) -> str:
 
 def _manifest_lines(folder: Path) -> list[str]:
     try:
-        return _read(folder / MANIFEST).decode().splitlines()
+        return (folder / MANIFEST).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise BundleError(folder, f"{folder / MANIFEST} can't be read: {error}. Promote again.") from error
 
@@ -204,16 +181,8 @@ def _read_manifest(folder: Path) -> dict[str, str]:
     return recorded
 
 
-def _is_cached(path: Path) -> bool:
-    return "__pycache__" in path.parts
-
-
-def _is_bytecode(path: Path) -> bool:
-    return _is_cached(path) and path.suffix == ".pyc"
-
-
-def _files(folder: Path, is_passed_over: Callable[[Path], bool] = _is_cached) -> list[str]:
-    """Return everything but folders and the manifest; bytecode, which is never read, does not count.
+def _files(folder: Path) -> list[str]:
+    """Return everything but folders and the manifest; what is in __pycache__, which is never read, does not count.
 
     Raises
     ------
@@ -228,53 +197,21 @@ def _files(folder: Path, is_passed_over: Callable[[Path], bool] = _is_cached) ->
         if stat.S_ISDIR(status.st_mode):
             continue
         if not stat.S_ISREG(status.st_mode):
-            raise _not_regular(path, folder)
-        if name.as_posix() in _TEXTS:
-            _check_text(path, status.st_size)
+            raise BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
+        if name.as_posix() in (*_TEXTS, MANIFEST) and status.st_size > _MOST_TEXT_BYTES:
+            limit = f"{_MOST_TEXT_BYTES // 1024**2} MB"
+            raise BundleError(folder, f"{path} is larger than {limit}, which no text of a bundle is. Promote again.")
         total_bytes += status.st_size
         if total_bytes > MOST_BYTES:
             limit = f"{MOST_BYTES // 1024**3} GB"
             raise BundleError(folder, f"{folder} holds more than {limit}, up to {name}. Keep large data elsewhere.")
-        if name.as_posix() != MANIFEST and not is_passed_over(name):
+        if name.as_posix() != MANIFEST and "__pycache__" not in name.parts:
             found.append(name)
     return [name.as_posix() for name in sorted(found)]
 
 
-def _not_regular(path: Path, folder: Path) -> BundleError:
-    name = path.relative_to(folder).as_posix()
-    return BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
-
-
-def _opened(path: Path) -> io.BufferedReader:
-    """Open a regular file. Neither waits for the writer of a FIFO nor follows a link."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        if error.errno in (errno.ELOOP, errno.ENXIO):
-            raise _not_regular(path, path.parent) from error
-        raise
-    file = os.fdopen(descriptor, "rb")
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        file.close()
-        raise _not_regular(path, path.parent)
-    return file
-
-
-def _read(path: Path) -> bytes:
-    """Return the bytes of a text."""
-    with _opened(path) as file:
-        _check_text(path, os.fstat(file.fileno()).st_size)
-        return file.read()
-
-
-def _check_text(path: Path, size: int) -> None:
-    if size > _MOST_TEXT_BYTES:
-        limit = f"{_MOST_TEXT_BYTES // 1024**2} MB"
-        raise BundleError(path.parent, f"{path} is larger than {limit}, which no text of a bundle is. Promote again.")
-
-
 def _hash(path: Path) -> str:
-    with _opened(path) as file:
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

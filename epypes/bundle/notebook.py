@@ -96,7 +96,6 @@ def _lines_of(pipe: Path, on_line: OnText) -> Iterator[None]:
 def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> None:
     with optional_import():
         import nbformat
-        from jupyter_client.manager import AsyncKernelManager
         from nbclient import NotebookClient
         from nbclient.exceptions import CellExecutionError, DeadKernelError
 
@@ -116,30 +115,21 @@ def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> No
         done += 1
         on_cell(min(done, total), total)
 
-    class PrivateKernelManager(AsyncKernelManager):
-        """Talks to the kernel through sockets in a folder of this user: over TCP others on the machine could listen."""
-
-        def _transport_default(self) -> str:
-            return "ipc"
-
-        def _ip_default(self) -> str:
-            return str(scratch / "kernel")
-
     client = NotebookClient(
         document,
-        kernel_manager_class=PrivateKernelManager,
         timeout=None,
         kernel_name="python3",
         resources={"metadata": {"path": str(path.resolve().parent)}},
         on_cell_executed=cell_executed,
     )
+    # Sockets in a folder of this user: over TCP others on the machine could listen.
+    client.config.KernelManager.transport = "ipc"
+    client.config.KernelManager.ip = str(scratch / "kernel")
     try:
         client.execute()
     except CellExecutionError as error:
-        number = done
-        raise BundleError(
-            path, f"{path}: code cell {number} of {total} raised {error.ename}: {error.evalue}"
-        ) from error
+        text = f"{path}: code cell {done} of {total} raised {error.ename}: {error.evalue}"
+        raise BundleError(path, text) from error
     except DeadKernelError as error:
         raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
 

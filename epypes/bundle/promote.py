@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.adapters import ANSWERS, record_answer
+from epypes.bundle.clone import clone_runner
 from epypes.bundle.determinism import learn
 from epypes.bundle.emit import write_module
 from epypes.bundle.expressions import write_arrays
@@ -86,8 +87,7 @@ def promote(
             draft = Path(scratch) / target.name
             _write(draft, target, subject, outputs, samples, on_progress)
             on_progress("replaying in a fresh process")
-            for note in prove(draft, target).notes:
-                on_progress(note)
+            prove(draft, target)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):
@@ -168,7 +168,7 @@ def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Ru
     for number, sample in enumerate(samples, 1):
         payload = sample if isinstance(sample, Mapping) else dict(zip(free[:1], [sample], strict=False))
         try:
-            run = subject.fresh_runner().run_on(payload)
+            run = clone_runner(subject.runner).run_on(payload)
         except Exception as error:  # whatever a function raises on it
             text = f"Sample {number} can't be run: {type(error).__name__}: {error}"
             raise PromotionRefused(target, [text]) from error
@@ -200,7 +200,7 @@ def _record(draft: Path, name: str, target: Path, subject: Subject, run: Run, se
         raise PromotionRefused(target, [str(error)]) from error
     # An answer is compared to the last bit, which noise would change.
     if "f_out" in subject.ports and not settings.tolerances:
-        runs = run, subject.fresh_runner().run_on(inputs)
+        runs = run, clone_runner(subject.runner).run_on(inputs)
         record_answer(draft / ANSWERS / name, subject.ports["f_out"], settings.name, runs, settings.attributes)
 
 

@@ -6,15 +6,14 @@ records the samples anew instead.
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,18 +79,7 @@ class ReplayReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values, as JSON has them."""
-        from dataclasses import asdict
-
         return {"identical": self.identical, **asdict(self)}
-
-
-def report_from(outcome: Mapping[str, Any]) -> ReplayReport:
-    """Return the report that a process has written as JSON."""
-    found = (Difference(**entry) for entry in outcome["differences"])
-    texts = {name: tuple(outcome[name]) for name in ("requirements", "unsteady", "causes", "notes", "outside")}
-    return ReplayReport(
-        outcome["samples"], outcome["tokens"], tuple(found), environment=outcome["environment"], **texts
-    )
 
 
 REPLAY_TIMEOUT_S = 600.0
@@ -99,14 +87,12 @@ REPLAY_TIMEOUT_S = 600.0
 
 def replay_isolated(
     folder: Path,
+    options: Sequence[str] = (),
     *,
-    sealed: bool,
     timeout_s: float = REPLAY_TIMEOUT_S,
     python: str = sys.executable,
-    twice: bool = False,
     environment: Mapping[str, str] | None = None,
     cwd: Path | None = None,
-    watched: bool = True,
 ) -> ReplayReport:
     """Replay in a new interpreter that sees neither the current folder nor the variables that Python reads.
 
@@ -114,40 +100,16 @@ def replay_isolated(
     ----------
     folder
         The bundle.
-    sealed
-        Whether it must be what was promoted.
+    options
+        ``"--unsealed"``: it need not be what was promoted. ``"--twice"``: every sample is replayed a second time, in
+        the opposite order. ``"--unwatched"``: without the requirements, and the files outside of the bundle.
+        ``"--record"``: the samples are recorded anew, and nothing is compared.
     timeout_s
         When the process is ended.
     python
         The interpreter, this one without.
-    twice
-        Whether every sample is replayed a second time, in the opposite order.
     environment, cwd
         The variables and the working folder of the process; this environment and a new folder without.
-    watched
-        Whether the report has the requirements and the files outside of the bundle.
-
-    Raises
-    ------
-    BundleError
-        The process failed or took longer than ``timeout_s``.
-    """
-    options = {"--unsealed": not sealed, "--twice": twice, "--watched": watched}
-    arguments = [option for option, is_given in options.items() if is_given]
-    outcome = run_isolated(folder, arguments, timeout_s=timeout_s, python=python, environment=environment, cwd=cwd)
-    return report_from(outcome)
-
-
-def run_isolated(
-    folder: Path,
-    arguments: Sequence[str],
-    *,
-    timeout_s: float = REPLAY_TIMEOUT_S,
-    python: str = sys.executable,
-    environment: Mapping[str, str] | None = None,
-    cwd: Path | None = None,
-) -> Any:
-    """Run this module as a program on a bundle, in a new interpreter; return what it has written as JSON.
 
     Raises
     ------
@@ -159,7 +121,7 @@ def run_isolated(
         try:
             # Isolated as by -I, which would also have it overlook PYTHONHASHSEED.
             done = subprocess.run(  # noqa: S603 - an interpreter, a module of ours
-                [python, "-s", "-P", "-m", "epypes.bundle.replay", str(folder.resolve()), str(out), *arguments],
+                [python, "-s", "-P", "-m", "epypes.bundle.replay", str(folder.resolve()), str(out), *options],
                 cwd=cwd or scratch,
                 env=without_python() if environment is None else environment,
                 stdin=subprocess.DEVNULL,
@@ -176,7 +138,11 @@ def run_isolated(
         outcome = json.loads(out.read_text(encoding="utf-8"))
     if "error" in outcome:
         raise BundleError(folder, outcome["error"])
-    return outcome
+    found = tuple(Difference(**entry) for entry in outcome.pop("differences"))
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in outcome.items()
+    }
+    return ReplayReport(differences=found, **values)
 
 
 def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
@@ -199,7 +165,7 @@ def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
         if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
             ports = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
             why = f"its ports are {ports}, those of pipeline.toml are not"
-            found.append(Difference(path.stem, ", ".join(bundle.settings.outputs), why))
+            found.append(Difference(why, sample=path.stem, token=", ".join(bundle.settings.outputs)))
         run = _run(bundle, inputs)
         differing = [*_differing(bundle, path.stem, outputs, run)]
         if differing:
@@ -218,9 +184,8 @@ def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
     return ReplayReport(len(bundle.samples), tokens, tuple(found), environment=environment(), unsteady=tuple(unsteady))
 
 
-def record_again(folder: Path) -> dict[str, Any]:
-    """Run the samples of an unsealed bundle in this process, and record their outputs and answers."""
-    bundle = read_bundle(folder, sealed=False)
+def record_again(bundle: Bundle) -> ReplayReport:
+    """Run a bundle's samples in this process, and record their outputs and answers."""
     settings = bundle.settings
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
@@ -230,7 +195,7 @@ def record_again(folder: Path) -> dict[str, Any]:
         if answer.is_file():
             answer.unlink()
             record_answer(answer, bundle.own["f_out"], settings.name, (run, _run(bundle, inputs)), settings.attributes)
-    return {"samples": len(bundle.samples)}
+    return ReplayReport(len(bundle.samples), 0, ())
 
 
 def _run(bundle: Bundle, inputs: dict[str, Any]) -> Any:
@@ -249,16 +214,23 @@ def _differing(bundle: Bundle, sample: str, outputs: dict[str, Any], run: Any) -
 def main(arguments: list[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
-    work = record_again if "--record" in arguments else functools.partial(_replayed, options=arguments[2:])
-    out.write_text(json.dumps(_outcome_of(folder, work)), encoding="utf-8")
+    try:
+        outcome = asdict(_replayed(folder, arguments[2:]))
+    except EpypesError as error:
+        outcome = {"error": str(error)}
+    except BaseException as error:
+        outcome = {"error": _describe(error, folder)}
+    out.write_text(json.dumps(outcome), encoding="utf-8")
     return 0
 
 
-def _replayed(folder: Path, options: Sequence[str]) -> dict[str, Any]:
-    """Replay; with ``--watched`` the report has what that has imported and opened."""
-    is_sealed, twice = "--unsealed" not in options, "--twice" in options
-    if "--watched" not in options:
-        return replay(read_bundle(folder, sealed=is_sealed), twice=twice).to_dict()
+def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
+    """Replay, or record anew, as the options say; a report has what was imported and opened unless ``--unwatched``."""
+    is_sealed, twice = not {"--unsealed", "--record"} & {*options}, "--twice" in options
+    if "--record" in options:
+        return record_again(read_bundle(folder, sealed=is_sealed))
+    if "--unwatched" in options:
+        return replay(read_bundle(folder, sealed=is_sealed), twice=twice)
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
         try:
@@ -273,18 +245,7 @@ def _replayed(folder: Path, options: Sequence[str]) -> dict[str, Any]:
         report = replay(bundle, twice=twice)
     named = import_all_of((folder / MODULE).read_text(encoding="utf-8"))
     requirements = requirement_lines(named | (sys.modules.keys() - before))
-    report = replace(report, outside=access.files, notes=(*report.notes, *access.notes), requirements=requirements)
-    return report.to_dict()
-
-
-def _outcome_of(folder: Path, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
-    """Return what some work with a bundle returns, or as an error what stopped it."""
-    try:
-        return work(folder)
-    except EpypesError as error:
-        return {"error": str(error)}
-    except BaseException as error:
-        return {"error": _describe(error, folder)}
+    return replace(report, outside=access.files, requirements=requirements)
 
 
 def _describe(error: BaseException, folder: Path) -> str:

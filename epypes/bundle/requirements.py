@@ -26,10 +26,6 @@ from epypes.errors import BundleError
 
 REQUIREMENTS: Final = "requirements.txt"
 INSTALL_TIMEOUT_S: Final = 1200.0
-# Distributions that bring the same module: only one of them is to be installed.
-_TWINS: Final = (
-    frozenset({"opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless"}),
-)
 _LARGE_BYTES: Final = 4_000_000
 _OURS: Final = "epypes"
 # What EPypes needs to read samples; the rest of what it needs is for serving.
@@ -76,7 +72,10 @@ def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:
         new = {name for name in _requires(waiting.pop()) if _is_loaded(name)} - names
         names |= new
         waiting += new
-    return tuple(line for name in sorted(names | {_OURS}) for line in _lines(name))
+    twins: dict[str, set[str]] = {}
+    for module in modules:
+        twins.setdefault(_distribution(module), set()).update(_owners(module))
+    return tuple(line for name in sorted(names | {_OURS}) for line in _lines(name, twins.get(name, set()) - {name}))
 
 
 def _requires(name: str) -> Iterator[str]:
@@ -102,11 +101,17 @@ def _distribution(name: str) -> str:
         return ""
     if not candidates:
         return next((found for folder, found in _editable().items() if _is_in(file, folder)), "")
-    if len(candidates) == 1:
-        return candidates[0]
-    owners = [found for found in candidates if file in _files(found)] or candidates
     # Each has overwritten the files of the others; the hashes in its record are of what it had brought.
-    return max(owners, key=lambda distribution: sum(map(_agrees, _recorded(distribution, top))))
+    return max(_owners(name) or candidates, key=lambda owner: sum(map(_agrees, _recorded(owner, top))))
+
+
+@cache
+def _owners(name: str) -> tuple[str, ...]:
+    """Return the distributions that have brought the file of a module; more than one if they overwrite each other."""
+    candidates, file = bringing(name.partition(".")[0]), _file(name)
+    if len(candidates) == 1 or not file:
+        return candidates if file else ()
+    return tuple(found for found in candidates if file in _files(found))
 
 
 def bringing(top: str) -> tuple[str, ...]:
@@ -175,7 +180,7 @@ def install_source(distribution: metadata.Distribution) -> dict[str, Any]:
     return found if isinstance(found, dict) and isinstance(found.get("url"), str) else {}
 
 
-def _lines(name: str) -> list[str]:
+def _lines(name: str, twins: Collection[str]) -> list[str]:
     distribution = metadata.distribution(name)
     comments = []
     source = install_source(distribution)
@@ -186,26 +191,10 @@ def _lines(name: str) -> list[str]:
         comments.append(f"# {distribution.name} was installed {how}, not from an index: install it from there first.")
     if "+" in distribution.version:
         comments.append(f"# {distribution.version} is a local version: an index of its own has it.")
-    comments += [f"# {text}" for text in twins_of(name)]
+    if twins:
+        both = f"{name} and {', '.join(sorted(twins))} are both installed and overwrite each other"
+        comments.append(f"# {both}: uninstall all but one. The files that were loaded are those of {name}.")
     return [*comments, f"{distribution.name}=={distribution.version}"]
-
-
-def twins_of(name: str) -> list[str]:
-    """Return a warning if another distribution that brings the same module is installed beside one."""
-    twins = frozenset().union(*(family for family in _TWINS if name in family)) - {name}
-    others = sorted(twin for twin in twins if _is_there(twin))
-    if not others:
-        return []
-    text = f"{name} and {', '.join(others)} are both installed and overwrite each other: uninstall all but one."
-    return [f"{text} The files that were loaded are those of {name}."]
-
-
-def _is_there(name: str) -> bool:
-    try:
-        metadata.distribution(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def pins(lines: Iterable[str]) -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,6 @@ from epypes.bundle.hyperparameters import (
     LargeArray,
     Unwritable,
     fits,
-    members_in,
     plain,
     range_of,
     read,
@@ -29,9 +28,6 @@ from epypes.images import Order
 from epypes.optional import optional_import
 
 FORMAT: Final = 1
-# Of a bundle with what the first one has not: ports or a pipeline of its own, groups, attributes, values of new kinds.
-_FORMAT_WITH_MORE: Final = 2
-_FIRST_KINDS: Final = (None, "none", "tuple")
 _LINE: Final = 100
 
 
@@ -79,24 +75,6 @@ class Settings:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     has_groups: bool = False
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-    @property
-    def has_members(self) -> bool:
-        """Whether a value is a member of an enumeration, which the bundle's module has."""
-        return any(_has_member(value) for values in self._values for value in values.values())
-
-    @property
-    def _values(self) -> tuple[Mapping[str, Any], ...]:
-        return self.hyperparameters, self.defaults, self.attributes
-
-    def with_enums(self, enums: Mapping[str, Any]) -> Settings:
-        """Return the settings with members of enumerations in place of their names."""
-        if not self.has_members:
-            return self
-        hyperparameters, defaults, attributes = (
-            {name: read(written(value), enums) for name, value in values.items()} for values in self._values
-        )
-        return replace(self, hyperparameters=hyperparameters, defaults=defaults, attributes=attributes)
 
     def order(self, token: str) -> Order:
         """Return the order of a token's colours."""
@@ -146,7 +124,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
         )
     )
     bundle = tomlkit.table()
-    bundle.add("format", _format_of(settings))
+    bundle.add("format", FORMAT)
     bundle.add("name", settings.name)
     if not settings.types:
         bundle.add(tomlkit.comment("The annotations of the functions are not compared."))
@@ -167,23 +145,6 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
             document.add(section, table)
     add_tolerances(document, settings.tolerances)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
-
-
-def _has_member(value: Any) -> bool:
-    return any(True for _ in members_in(value))
-
-
-def _format_of(settings: Settings) -> int:
-    values = (*settings.hyperparameters.values(), *settings.defaults.values())
-    is_first = all(map(_is_of_first_kind, values)) and not (settings.own or settings.has_groups or settings.attributes)
-    return FORMAT if is_first else _FORMAT_WITH_MORE
-
-
-def _is_of_first_kind(value: Any) -> bool:
-    entry = written(value)
-    items = entry.get("value")
-    nested = isinstance(items, dict) or (isinstance(items, list) and any(isinstance(x, list | dict) for x in items))
-    return entry.get("kind") in _FIRST_KINDS and not nested
 
 
 def _ports(settings: Settings) -> Any:
@@ -256,19 +217,17 @@ def _item(part: Any) -> Any:
 
     if isinstance(part, dict):
         table = tomlkit.inline_table()
-        for key, item in part.items():
-            table.append(key, _item(item))
+        table.update(part)
         return table
     if not isinstance(part, list):
         return part
-    array = tomlkit.array()
-    for item in part:
-        array.append(_item(item))
-    has_rows = any(isinstance(item, list) for item in part) and len(part) > 1
-    return array.multiline(True) if has_rows or len(array.as_string()) > _LINE else array
+    item = tomlkit.array()
+    item.extend(part)
+    has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
+    return item.multiline(True) if has_rows or len(item.as_string()) > _LINE else item
 
 
-def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Settings:
+def read_settings(path: Path, enums: Mapping[str, Any] | None = None, content: bytes | None = None) -> Settings:
     """Read pipeline.toml.
 
     Parameters
@@ -277,6 +236,8 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         The file.
     enums
         The enumerations of the bundle's module by name. Without, members of them are read as :class:`Member`.
+    content
+        What stands in the file, where it is known.
 
     Raises
     ------
@@ -284,11 +245,10 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         It is not TOML, has another format, or lacks an entry; the entry is named.
     """
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads((path.read_bytes() if content is None else content).decode())
         bundle, ports = document["bundle"], document["ports"]
-        if bundle["format"] not in (FORMAT, _FORMAT_WITH_MORE):
-            known = f"{FORMAT} and {_FORMAT_WITH_MORE}"
-            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads the formats {known}.")
+        if bundle["format"] != FORMAT:
+            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
         entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),

@@ -14,7 +14,7 @@ from epypes.bundle.load import MAKER
 from epypes.bundle.resolve import Refused
 from epypes.bundle.slice import Slice
 from epypes.bundle.syntax import laid_out, quoted
-from epypes.graph import CompGraph, with_defaults
+from epypes.graph import CompGraph
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 from epypes.run import CompGraphRunner
 from epypes.run.guard import as_written
@@ -57,10 +57,6 @@ class Subject:
         if self.pipeline is None or kind in _OURS:
             return {}
         return {f"Class {kind.__name__!r} of pipeline {self.pipeline.name!r}": kind}
-
-    def fresh_runner(self) -> CompGraphRunner:
-        """Return a runner with the same hyperparameters; what was unfrozen has no default there."""
-        return CompGraphRunner(with_defaults(self.cg, {}), self.runner.hyperparameters)
 
 
 def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from epypes.bundle.manifest import changed_since_recorded, check_manifest, environment_differences, recorded_environment
+from epypes.bundle.manifest import check_manifest, environment_differences, recorded_environment
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, ReplayReport, replay_isolated
 from epypes.bundle.requirements import REQUIREMENTS, fresh_environment, pins
 from epypes.errors import BundleChanged, BundleError, ReplayDiffers
@@ -63,12 +65,10 @@ def verify(
             text = f"{error} Nothing of it was run; to run the changed code: epypes verify --run-anyway."
             raise BundleChanged(folder, text) from None
         change = error
+    options = [] if change is None else ["--unsealed"]
     try:
-        if fresh_env:
-            with fresh_environment(folder) as python:
-                report = replay_isolated(folder, sealed=change is None, timeout_s=timeout_s, python=python)
-        else:
-            report = replay_isolated(folder, sealed=change is None, timeout_s=timeout_s)
+        with fresh_environment(folder) if fresh_env else contextlib.nullcontext(sys.executable) as python:
+            report = replay_isolated(folder, options, timeout_s=timeout_s, python=python)
     except BundleError as error:
         if change is None:
             raise
@@ -82,9 +82,9 @@ def verify(
         *environment_differences(recorded_environment(folder), report.environment),
     )
     if report.identical:
-        return replace(report, notes=(*report.notes, *report.outside, *notes))
+        return replace(report, notes=(*report.outside, *notes))
     tokens = ", ".join(map(repr, report.unsteady))
-    causes = (*changed_since_recorded(folder), *([_UNSTEADY.format(tokens)] if tokens else []), *notes)
+    causes = (*([_UNSTEADY.format(tokens)] if tokens else []), *notes)
     raise ReplayDiffers(path, replace(report, causes=causes or (_UNKNOWN,)))
 
 

@@ -14,7 +14,7 @@ from epypes.bundle.hyperparameters import alike, fits, read, written
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest, digest
 from epypes.bundle.proof import prove, swap_folders
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, run_isolated
+from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
 
@@ -131,7 +131,7 @@ def _diff(before: str, after: str) -> str:
 def _record(draft: Path, target: Path, timeout_s: float) -> None:
     """Record the outputs of a draft's samples again, replay and seal it."""
     try:
-        run_isolated(draft, ["--record"], timeout_s=timeout_s)
+        replay_isolated(draft, ["--record"], timeout_s=timeout_s)
         prove(draft, target, timeout_s)
     except BundleError as error:
         reasons = error.reasons if isinstance(error, PromotionRefused) else (str(error),)

@@ -304,7 +304,7 @@ def test_events_of_a_pipeline_fail_and_the_next_ones_do_not_depend_on_them(tmp_p
         if view["y"] == 50: seen.append(50)
         return view["y"] + len(seen)
     """
-    settings = SETTINGS.replace("format = 1", "format = 2") + 'own = ["f_in", "f_out"]\n'
+    settings = SETTINGS + 'own = ["f_in", "f_out"]\n'
     q_in, q_out, failures = queue.Queue(), queue.Queue(), queue.Queue()
     pipeline = ep.load_pipeline(bundle(tmp_path / "b", source, settings), q_in, q_out)
     pipeline.on_error = failures.put

@@ -15,7 +15,7 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify
 from epypes.bundle.load import read_bundle
-from epypes.bundle.manifest import changed_since_recorded, recorded_environment, write_manifest
+from epypes.bundle.manifest import recorded_environment, write_manifest
 from epypes.bundle.replay import replay
 from epypes.errors import BundleError, ReplayDiffers
 from epypes.wire import load_sample, save_sample
@@ -86,9 +86,6 @@ def test_a_changed_constant_is_named_with_its_line_and_the_first_difference(fold
     write_manifest(folder)
     with pytest.raises(ReplayDiffers) as caught:
         verify(folder)
-    assert caught.value.report.causes[0] == (
-        f"Since the samples were recorded, pipeline.py was changed at line {line}: OFFSET = 41."
-    )
     tokens = [difference.token for difference in caught.value.report.differences]
     assert tokens == ["marked", "points"], "and not the words, which do not depend on it"
 
@@ -117,7 +114,6 @@ def test_a_line_that_was_added_or_removed_is_named(folder):
 def test_a_changed_setting_is_named_with_its_line(folder):
     change(folder / "pipeline.toml", "value = 5", "value = 3")
     assert "pipeline.toml was changed at line" in refused(folder)
-    write_manifest(folder)
     assert ": value = 3." in refused(folder)
 
 
@@ -129,8 +125,6 @@ def test_a_changed_expected_output_is_named_with_token_and_index(folder):
     save_sample(path, inputs, {**outputs, "marked": marked})
     assert "samples/000.npz was changed" in refused(folder)
     assert "token 'marked': 1 of 19200 values differ, first at [7, 9]" in refused(folder)
-    write_manifest(folder)
-    assert "Likely: samples/000.npz is not the file that was recorded." in refused(folder)
 
 
 def test_a_changed_keypoint_is_named_by_its_field(folder):
@@ -181,11 +175,10 @@ def test_the_manifest_is_one_that_sha256sum_reads(folder):
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-def test_sealing_again_keeps_what_the_samples_were_recorded_with(folder):
+def test_sealing_again_keeps_what_the_samples_were_recorded_on(folder):
     before = (folder / "MANIFEST.sha256").read_bytes()
     write_manifest(folder)
     assert (folder / "MANIFEST.sha256").read_bytes() == before
-    assert changed_since_recorded(folder) == []
 
 
 @pytest.mark.usefixtures("fresh_interpreter")
@@ -197,7 +190,6 @@ def test_values_that_differ_from_run_to_run_are_said_to(folder):
 
 
 def test_without_a_known_cause_the_usual_ones_are_named(folder):
-    without_comments(folder)
     change(folder / "pipeline.toml", "value = 5", "value = 3")
     write_manifest(folder)
     assert "Likely: Neither the bundle nor what it runs on has changed as far as is known" in refused(folder)
