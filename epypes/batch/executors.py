@@ -95,6 +95,11 @@ def run_jobs(
     return _run_in_flight(backend, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
 
 
+def runs_here(executor: Executor | None) -> bool:
+    """Whether an executor runs the jobs in this process, where they can share an item's run."""
+    return executor is None or isinstance(executor, ThreadPoolExecutor)
+
+
 def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
     for job in jobs:

@@ -190,6 +190,15 @@ class SharedStart:
             self._runner = None if begun is None else branched(begun)
             return begun
 
+    @property
+    def nbytes(self) -> int:
+        """How many bytes the arrays of the run have."""
+        last = None if self._runner is None else self._runner.last
+        if last is None:
+            return 0
+        values = (last[token] for token in last.cg.tokens if last.tokens.is_readable(token))
+        return sum(getattr(value, "nbytes", 0) for value in values)
+
     def move_to(self, runner: CompGraphRunner) -> None:
         """Let the next job branch from this runner's last run."""
         with self._lock:

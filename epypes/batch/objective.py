@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
@@ -91,11 +91,12 @@ class Objective:
         for token in self.keep:
             cg.require_token(token)
 
-    def score(self, outcomes: Iterable[Outcome]) -> Score:
-        """Return the score of a setting by its outcomes, in the order of the cases; it ends at the first failure."""
+    def score(self, outcomes: Mapping[int, Outcome]) -> Score:
+        """Return the score of a setting by its outcomes, by place of the case; it ends at the first failure."""
         values: list[float] = []
         spent_ns = 0
-        for case, outcome in zip(self.cases, outcomes, strict=True):
+        for index, outcome in sorted(outcomes.items()):
+            case = self.cases[index]
             spent_ns += outcome.total_ns
             error = outcome.error_info
             value, failure = self._measured(case, outcome) if error is None else (math.nan, str(error))

@@ -6,15 +6,14 @@ import contextlib
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cases import Case, cases_of, with_labels_read
-from epypes.batch.executors import run_jobs, worker_count
-from epypes.batch.incremental import CaseRunners, SearchStopped
+from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.items import Item, detached_runner, items_of
-from epypes.batch.job import Job
+from epypes.batch.job import Job, SharedStart
 from epypes.batch.objective import Objective, ObjectiveMetric, Score, code_digests, search_digests, search_name
 from epypes.batch.progress import progress_bar
 from epypes.batch.ranges import axes_of
@@ -29,6 +28,8 @@ from epypes.wording import ended
 if TYPE_CHECKING:
     from epypes.store import Store
 
+# Of the values that are held between settings; further cases run from their files or arrays each time.
+MOST_BYTES: Final = 2**30
 _CASE_FILE: Final = ".toml"
 _DIRECTIONS: Final = ("maximize", "minimize")
 
@@ -67,8 +68,8 @@ def optimize(
         How many trials there are to be: with a store, those that are in there already count.
     executor
         Runs the cases, as for ``ep.map``; several trials then run at a time, so the settings that are tried depend on
-        the order in which trials end. Without, the calling thread does, and runs of each case only what depends on what
-        has changed.
+        the order in which trials end. Threads, and the calling thread without, run of each case only what depends on
+        what has changed.
     direction
         ``"maximize"`` or ``"minimize"``.
     ranges
@@ -86,7 +87,7 @@ def optimize(
         searched, from what the metric computes, and from the cases: what goes into them, their labels and their
         hyperparameters. A study that has been searched for another one of these is refused.
     stop
-        Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. The trials
+        Ends the search once it is set: when the case that runs has ended. So does Ctrl+C, at once. The trials
         that have ended until then are returned.
     on_trial
         Is called with each ``Trial`` that has ended, by the thread that calls this.
@@ -172,45 +173,41 @@ class _Evaluation:
     def is_stopped(self) -> bool:
         return self.stop is not None and self.stop.is_set()
 
-    @property
-    def own(self) -> list[Mapping[str, Any]]:
-        """The hyperparameters of each case that are its own."""
-        return [case.hyperparameters or {} for case in self.objective.cases]
-
     def scores(self, search: Search, count: int) -> Generator[tuple[Suggestion, Score]]:
         """Yield the scores of the next settings as they come; fewer if the search is stopped."""
-        asked = (search.ask() for _ in range(count))
-        return self._in_this_thread(asked) if self.executor is None else self._on_executor(asked, self.executor)
-
-    def _in_this_thread(self, asked: Iterator[Suggestion]) -> Generator[tuple[Suggestion, Score]]:
-        runners = CaseRunners(self.runner, self.items, self.own, self.objective.keep, self.stop)
-        while not self.is_stopped and (one := next(asked, None)) is not None:
-            try:
-                score = self.objective.score(runners.outcomes(one.setting))
-            except SearchStopped:
-                return
-            yield one, score
-
-    def _on_executor(self, asked: Iterator[Suggestion], executor: Executor) -> Generator[tuple[Suggestion, Score]]:
         pending: dict[int, tuple[Suggestion, dict[int, Outcome]]] = {}
-        keep, count = self.objective.keep, len(self.items)
+        # In this process each case goes on from its last run, as far as memory is for that.
+        starts = [SharedStart() if runs_here(self.executor) else None for _ in self.items]
+        held_bytes = 0
 
         def jobs() -> Iterator[Job]:
             """Yield a job for each case of each trial, when there is room; a trial is asked for with its first."""
-            for number, one in enumerate(asked):
+            keep = self.objective.keep
+            for number in range(count):
+                one = search.ask()
                 pending[number] = one, {}
-                for item, own in zip(self.items, self.own, strict=True):
-                    marked = Item(number * count + item.number, item.name, item.payload)
-                    yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
+                for item, case, index in zip(self.items, self.objective.cases, range(len(starts)), strict=True):
+                    if number not in pending:  # a case before has failed
+                        break
+                    marked = replace(item, number=number * len(starts) + index)
+                    setting = {**one.setting, **(case.hyperparameters or {})}
+                    yield Job((marked,), (setting,), keep=keep, start=starts[index], targets=keep)
 
-        for outcomes in run_jobs(self.runner, jobs(), executor, ahead=worker_count(executor), stop=self.stop):
-            for outcome in outcomes:
-                number, index = divmod(outcome.number, count)
+        ahead = None if self.executor is None else worker_count(self.executor)
+        for [outcome] in filter(None, run_jobs(self.runner, jobs(), self.executor, ahead=ahead, stop=self.stop)):
+            number, index = divmod(outcome.number, len(starts))
+            start = starts[index]
+            if number == 0 and start is not None:
+                held_bytes += start.nbytes
+                if held_bytes > MOST_BYTES:
+                    held_bytes -= start.nbytes
+                    starts[index] = None
+            if number in pending:
                 one, found = pending[number]
                 found[index] = outcome
-                if len(found) == count:
+                if len(found) == len(starts) or outcome.has_failed:
                     del pending[number]
-                    yield one, self.objective.score([found[index] for index in range(count)])
+                    yield one, self.objective.score(found)
 
 
 def _searched(
