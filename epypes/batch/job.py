@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Final
@@ -203,3 +205,29 @@ class SharedStart:
         """Let the next job branch from this runner's last run."""
         with self._lock:
             self._runner = branched(runner)
+
+
+class RunnerPool:
+    """Runners for the threads of a pool, each used by one thread at a time.
+
+    Parameters
+    ----------
+    make
+        Returns a new runner; called when no runner is idle.
+    """
+
+    def __init__(self, make: Callable[[], CompGraphRunner]) -> None:
+        self._make = make
+        self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
+
+    @contextmanager
+    def runner(self) -> Iterator[CompGraphRunner]:
+        """Yield a runner that no other thread uses meanwhile."""
+        try:
+            own = self._idle.get_nowait()
+        except queue.Empty:
+            own = self._make()
+        try:
+            yield own
+        finally:
+            self._idle.put(own)

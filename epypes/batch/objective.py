@@ -10,7 +10,6 @@ from typing import Any, Final
 
 from epypes.batch.cache import (
     NoDigest,
-    combined_digest,
     function_digest,
     graph_fingerprint,
     payload_digest,
@@ -18,6 +17,7 @@ from epypes.batch.cache import (
     value_digest,
 )
 from epypes.batch.cases import Case
+from epypes.batch.fingerprint import combined_digest
 from epypes.batch.items import Item
 from epypes.batch.ranges import Axis, ChoiceAxis
 from epypes.batch.results import Outcome
