@@ -21,7 +21,7 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import replace
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from epypes.batch.items import payload_of
 from epypes.batch.job import Job, RunnerPool, run_job
@@ -112,16 +112,6 @@ def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Even
 # -- jobs in flight -------------------------------------------------------------------------------------------------
 
 
-class _Backend(Protocol):
-    """How an executor runs a job."""
-
-    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
-        """Give a job to the executor; ``with_files``: with all that a worker process needs."""
-
-    def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
-        """Return the outcomes of a job that is done."""
-
-
 class _SubmitRefused(Exception):
     """The executor takes no jobs any more: it was shut down, or its client closed."""
 
@@ -135,7 +125,7 @@ class _WorkersKilled(Exception):
 
 
 def _run_in_flight(
-    backend: _Backend, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
+    backend: _Threads | _Processes, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
 ) -> Iterator[list[Outcome]]:
     """Keep so many jobs in flight; yield what comes; leave none behind, however it ends."""
     in_flight: dict[Future[Any], Job] = {}
@@ -178,7 +168,7 @@ def _run_in_flight(
             future.cancel()
 
 
-def _last_outcomes(backend: _Backend, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
+def _last_outcomes(backend: _Threads | _Processes, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
     """Yield the outcomes of jobs that have begun; no other begins any more."""
     ready, _ = wait({future for future in in_flight if not future.cancel()}, _GRACE_S)
     for future in ready:

@@ -12,7 +12,7 @@ from time import perf_counter_ns
 from typing import Any, Final
 
 from epypes.batch.items import Item, payload_of
-from epypes.batch.results import ErrorInfo, Outcome, is_endless, long_number, plain_number
+from epypes.batch.results import ErrorInfo, Outcome, scalar
 from epypes.batch.thumbnails import Album
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.shown import Look
@@ -153,13 +153,9 @@ def _error_info(failure: Failure) -> ErrorInfo:
 
 def _value(value: Any) -> Any:
     """Return a value as a table shows it."""
-    if type(value) is int and is_endless(value):
-        return long_number(value)
+    value = scalar(value)
     if value is None or type(value) in (bool, int, float, str):
         return value
-    number = plain_number(value)
-    if number is not None:
-        return number
     return str(value) if isinstance(value, str) else sketch(value, Look()).shown.text
 
 
