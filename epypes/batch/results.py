@@ -170,7 +170,7 @@ def scalar(value: Any) -> Any:
     return item if isinstance(item, bool | int | float) else value
 
 
-_FIXED: Final = ("name", "failure", "total_ms")
+FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 def outcomes_frame(
@@ -201,7 +201,7 @@ def outcomes_frame(
     tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
     functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
     for token in tokens:
-        is_taken = token in columns or token in _FIXED
+        is_taken = token in columns or token in FIXED_COLUMNS
         columns[f"{token} (token)" if is_taken else token] = _column(
             [outcome.values.get(token) for outcome in outcomes]
         )

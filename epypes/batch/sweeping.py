@@ -17,7 +17,7 @@ from epypes.batch.items import Item, count_of, detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import OutcomeCollector
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, outcomes_frame
+from epypes.batch.results import FIXED_COLUMNS, Outcome, outcomes_frame
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.run import CompGraphRunner
 from epypes.store import Store
@@ -31,7 +31,6 @@ _MOST_PICTURES: Final = 200_000
 # Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
 _PARTS: Final = 16
 _MOST_SETTINGS: Final = 256
-_FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +72,7 @@ class SweepResult:
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
         varied = {
-            f"{name} (hyperparameter)" if name in _FIXED_COLUMNS else name: [
+            f"{name} (hyperparameter)" if name in FIXED_COLUMNS else name: [
                 one.setting.get(name) for one in self.outcomes
             ]
             for name in self.names
