@@ -191,6 +191,7 @@ class _Evaluation:
         pending: dict[int, tuple[Suggestion, dict[int, Outcome]]] = {}
         # In this process each case goes on from its last run, as far as memory is for that.
         starts = [SharedStart() if runs_here(self.executor) else None for _ in self.items]
+        measured: set[int] = set()
         held_bytes = 0
 
         def jobs() -> Iterator[Job]:
@@ -210,7 +211,8 @@ class _Evaluation:
         for [outcome] in filter(None, run_jobs(self.runner, jobs(), self.executor, ahead=ahead, stop=self.stop)):
             number, index = divmod(outcome.number, len(starts))
             start = starts[index]
-            if number == 0 and start is not None:
+            if start is not None and index not in measured:
+                measured.add(index)
                 held_bytes += start.nbytes
                 if held_bytes > MOST_BYTES:
                     held_bytes -= start.nbytes

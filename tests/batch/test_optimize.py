@@ -232,6 +232,19 @@ def test_cases_that_do_not_fit_into_memory_are_run_anew(
     assert [trial.value for trial in anew] == [trial.value for trial in kept]
 
 
+def test_a_trial_ends_at_the_first_case_that_fails() -> None:
+    called = []
+
+    def divide(x: int, k: int) -> float:
+        called.append((x, k))
+        return x / k
+
+    cg = ep.CompGraph({"divide": divide}, {"divide": (("x", "k"), "y")})
+    result = ep.optimize(ep.CompGraphRunner(cg, {"k": 0}), "y", [1, 2, 3], 8, ranges={"k": (0, 1)})
+    assert set(called) == {(1, 0), (1, 1), (2, 1), (3, 1)}
+    assert "ZeroDivisionError" in result[0].failure
+
+
 def test_threads_give_the_values_that_one_thread_gives(runner: ep.CompGraphRunner) -> None:
     cases = [{"x": 0}, {"x": 2}, {"x": 3}]
     with ThreadPoolExecutor(2) as threads:
