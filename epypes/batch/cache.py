@@ -18,7 +18,6 @@ from warnings import warn
 
 from epypes.batch.fingerprint import Digester, combined_digest, file_digest, versions_of
 from epypes.batch.items import Item
-from epypes.batch.job import NO_SETTING
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
 from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
@@ -26,20 +25,6 @@ from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array
 from epypes.store import Series, Store, opened_store
-
-__all__ = [
-    "Fingerprint",
-    "NoDigest",
-    "OutcomeCache",
-    "combined_digest",
-    "function_digest",
-    "graph_fingerprint",
-    "outcome_cache",
-    "payload_digest",
-    "source_of",
-    "value_digest",
-    "value_label",
-]
 
 # What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
 _WRITE_EVERY_S: Final = 0.5
@@ -290,32 +275,29 @@ class OutcomeCache:
         self._series, self._suffix = series, suffix
         self._known = series.keys() if reads else frozenset()
         self._keys: dict[tuple[int, int], str] = {}
-        self._item_label: tuple[int, str | None] = -1, None
         # With the settings themselves, so that no other has the identity of one.
         self._setting_labels: dict[int, tuple[Mapping[str, Any], str | None]] = {}
         self._waiting: list[tuple[str, dict[str, Any]]] = []
         self._written_s = monotonic()
 
-    def find(self, item: Item, setting: Mapping[str, Any] = NO_SETTING) -> Outcome | None:
-        """Return the stored outcome of an item under a setting; None if it has to be run."""
-        of_item, of_setting = self._label_of_item(item), self._label_of_setting(setting)
-        if of_item is None or of_setting is None:
+    def found(self, item: Item, settings: Iterable[Mapping[str, Any]]) -> list[Outcome | None]:
+        """Return the stored outcomes of an item under settings; None for those that have to be run."""
+        try:
+            label = f"{item.name} {payload_digest(item.payload)} {self._suffix}"
+        except NoDigest:
+            return [None for _ in settings]
+        return [self._outcome(item, setting, label) for setting in settings]
+
+    def _outcome(self, item: Item, setting: Mapping[str, Any], of_item: str) -> Outcome | None:
+        of_setting = self._label_of_setting(setting)
+        if of_setting is None:
             return None
-        key = f"{of_item} {self._suffix} {of_setting}"
-        found = self._series.get(key) if key in self._known else None
-        if found is None:
+        key = f"{of_item} {of_setting}"
+        stored = self._series.get(key) if key in self._known else None
+        if stored is None:
             self._keys[item.number, id(setting)] = key
             return None
-        return Outcome.from_json(found, item, setting)
-
-    def _label_of_item(self, item: Item) -> str | None:
-        if self._item_label[0] != item.number:
-            try:
-                label = f"{item.name} {payload_digest(item.payload)}"
-            except NoDigest:
-                label = None
-            self._item_label = item.number, label
-        return self._item_label[1]
+        return Outcome.from_json(stored, item, setting)
 
     def _label_of_setting(self, setting: Mapping[str, Any]) -> str | None:
         if id(setting) not in self._setting_labels:

@@ -24,14 +24,22 @@ from epypes.batch.items import detached_runner, items_of, read_value
 from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, data_uri, object_column
+from epypes.batch.results import (
+    LEFT,
+    ErrorInfo,
+    Outcome,
+    Pictures,
+    Thumbnail,
+    frame_of,
+    html_row,
+    object_column,
+)
 from epypes.batch.thumbnails import DIFFERENCE_LEGEND, comparison_thumbnails
 from epypes.bundle.compare import first_difference
 from epypes.bundle.hyperparameters import Member
-from epypes.display.markup import content, escape, fitted
+from epypes.display.markup import content, fitted
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
-from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 
@@ -249,9 +257,7 @@ class CheckResult:
             "failure": object_column([outcome.reason or None for outcome in outcomes]),
             "run_ms": [outcome.total_ns / 1e6 for outcome in outcomes],
         }
-        with optional_import():
-            import pandas as pd
-        return pd.DataFrame(columns)
+        return frame_of(columns)
 
     def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:
         """Write JUnit XML, as continuous integration reads it, and return its path.
@@ -452,10 +458,8 @@ def _xml_text(text: str) -> str:
 # -- the page of a notebook -------------------------------------------------------------------------------------
 
 _MOST_ROWS: Final = 100
-_PICTURE_CHARACTERS: Final = 80_000
 _CELL_ROOM: Final = 100
 _REASON_ROOM: Final = 300
-_LEFT: Final = ' style="text-align:left"'
 # Colours that are read on a white and on a black ground; the mark and the text have the same meaning.
 _PASSED: Final = '<span style="color:#2e8b57">✓</span> passed'
 _FAILED: Final = '<b style="color:#d9482b">✗</b> <b>failed</b>'
@@ -465,30 +469,20 @@ def _page(result: CheckResult) -> str:
     """Return a table with a row per check, those that have not passed first, of at most about 120 kB."""
     shown = sorted(result.outcomes, key=lambda outcome: outcome.passed)[:_MOST_ROWS]
     pictured = [name for name in ("expected", "got", "difference") if any(name in one.pictures for one in shown)]
-    rows = [_row("th", ["case", "check", "value", "must be", "passed", *pictured])]
-    room = _PICTURE_CHARACTERS
+    rows = [html_row("th", ["case", "check", "value", "must be", "passed", *pictured])]
+    pictures = Pictures()
     for outcome in shown:
         value = "" if outcome.value is None else f"{outcome.value:.6g}"
         cells = [content(fitted(text, _CELL_ROOM)) for text in (outcome.case, outcome.check, value, outcome.threshold)]
         reason = content(fitted(outcome.reason, _REASON_ROOM))
         cells.append(_PASSED if outcome.passed else f"{_FAILED}<br>{reason}")
-        for name in pictured:
-            picture = outcome.pictures.get(name)
-            address = "" if picture is None else data_uri(picture)
-            if picture is None or len(address) > room:
-                cells.append("")
-                continue
-            room -= len(address)
-            alt = escape(fitted(f"{name} of {outcome.case}: {picture.caption}", _CELL_ROOM))
-            cells.append(f'<img src="{address}" alt="{alt}">')
-        rows.append(_row("td", cells))
+        for name, picture in ((name, outcome.pictures.get(name)) for name in pictured):
+            alt = "" if picture is None else fitted(f"{name} of {outcome.case}: {picture.caption}", _CELL_ROOM)
+            cells.append(pictures.image(picture, alt))
+        rows.append(html_row("td", cells))
     more = len(result.outcomes) - len(shown)
     if more:
-        rows.append(_row("td", [f"and {counted(more, 'check')} more"]))
+        rows.append(html_row("td", [f"and {counted(more, 'check')} more"]))
     caption = content(fitted(str(result), _REASON_ROOM))
     legend = f"<p>difference of masks: {DIFFERENCE_LEGEND}</p>" if "difference" in pictured else ""
-    return f"<table><caption{_LEFT}>{caption}</caption>{''.join(rows)}</table>{legend}"
-
-
-def _row(tag: str, cells: Iterable[str]) -> str:
-    return f"<tr>{''.join(f'<{tag}{_LEFT}>{cell}</{tag}>' for cell in cells)}</tr>"
+    return f"<table><caption{LEFT}>{caption}</caption>{''.join(rows)}</table>{legend}"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import threading
 import uuid
 from collections import deque
@@ -22,20 +21,22 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import replace
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
-from epypes.batch.items import Item, payload_of
-from epypes.batch.job import Job, run_job
+from epypes.batch.items import payload_of
+from epypes.batch.job import Job, RunnerPool, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
+    PackagedJob,
+    WorkerRefusal,
     known_package,
     package_of,
     packed_job,
     packed_values,
+    run_packaged_job,
     unpacked_outcomes,
 )
 from epypes.batch.results import ErrorInfo, Outcome
-from epypes.batch.worker_side import PackagedJob, WorkerRefusal, run_packaged_job
 from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ScaleError
 from epypes.run import CompGraphRunner
@@ -95,6 +96,11 @@ def run_jobs(
     return _run_in_flight(backend, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
 
 
+def runs_here(executor: Executor | None) -> bool:
+    """Whether an executor runs the jobs in this process, where they can share an item's run."""
+    return executor is None or isinstance(executor, ThreadPoolExecutor)
+
+
 def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
     for job in jobs:
@@ -104,16 +110,6 @@ def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Even
 
 
 # -- jobs in flight -------------------------------------------------------------------------------------------------
-
-
-class _Backend(Protocol):
-    """How an executor runs a job."""
-
-    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
-        """Give a job to the executor; ``with_files``: with all that a worker process needs."""
-
-    def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
-        """Return the outcomes of a job that is done."""
 
 
 class _SubmitRefused(Exception):
@@ -129,17 +125,16 @@ class _WorkersKilled(Exception):
 
 
 def _run_in_flight(
-    backend: _Backend, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
+    backend: _Threads | _Processes, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
 ) -> Iterator[list[Outcome]]:
     """Keep so many jobs in flight; yield what comes; leave none behind, however it ends."""
     in_flight: dict[Future[Any], Job] = {}
-    # Items whose workers were killed run again one at a time: then only the one that kills them is blamed.
+    # Jobs whose workers were killed run again one at a time: then only the one that kills them is blamed.
     isolated: deque[Job] = deque()
     alone: Job | None = None
     source, done = iter(jobs), 0
     try:
         while stop is None or not stop.is_set():
-            # One at a time, since the outcomes that have come decide about the size of the next job.
             while len(in_flight) < most and (job := next(source, None)) is not None:
                 in_flight[backend.submit(job)] = job
                 del job
@@ -158,7 +153,7 @@ def _run_in_flight(
                     continue
                 except _WorkersKilled:
                     if job is not alone:
-                        isolated.extend(replace(job, items=(item,)) for item in job.items)
+                        isolated.append(job)
                         continue
                     outcomes = _killed(job)
                 done += len(outcomes)
@@ -173,7 +168,7 @@ def _run_in_flight(
             future.cancel()
 
 
-def _last_outcomes(backend: _Backend, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
+def _last_outcomes(backend: _Threads | _Processes, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
     """Yield the outcomes of jobs that have begun; no other begins any more."""
     ready, _ = wait({future for future in in_flight if not future.cancel()}, _GRACE_S)
     for future in ready:
@@ -258,8 +253,9 @@ class _Threads:
     def __init__(
         self, runner: CompGraphRunner, executor: Executor, over: threading.Event, stop: threading.Event | None
     ) -> None:
-        self._runner, self._executor, self._over, self._stop = clone_runner(runner), executor, over, stop
-        self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
+        self._executor, self._over, self._stop = executor, over, stop
+        own = clone_runner(runner)
+        self._runners = RunnerPool(lambda: clone_runner(own))
 
     def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
         """Give a job to a thread."""
@@ -268,14 +264,8 @@ class _Threads:
     def _run(self, job: Job) -> list[Outcome]:
         if self._stop is not None and self._stop.is_set():
             return []
-        try:
-            own = self._idle.get_nowait()
-        except queue.Empty:
-            own = clone_runner(self._runner)
-        try:
+        with self._runners.runner() as own:
             return run_job(own, job, self._over)
-        finally:
-            self._idle.put(own)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""
@@ -349,71 +339,3 @@ def _job_error(error: Exception) -> EpypesError:
         return error
     needed = "Workers need epypes, of the same version, and what the graph imports."
     return ScaleError(f"A worker could not do its job: {ended(_error_text(error))} {needed}")
-
-
-# -- sizes of jobs --------------------------------------------------------------------------------------------------
-
-
-# The duration of a job, about: long beside the millisecond that its transfer takes, and short, since at the end all
-# workers wait for the last job.
-_JOB_NS: Final = 50_000_000
-_MOST_ITEMS: Final = 64
-# What is left is divided into so many groups per worker.
-_LAST_JOBS: Final = 3
-# Of arrays in one job, which wait in memory.
-_MOST_BYTES: Final = 4_000_000
-# The weight of one more outcome in the expected duration.
-_SHARE: Final = 0.2
-
-
-class JobSizes:
-    """Groups of items; the time that items take decides how many are in the next one.
-
-    Parameters
-    ----------
-    items
-        Taken one by one, when a group is asked for.
-    workers
-        How many work at once; 0: each group has one item only.
-    total
-        How many items there are, if that is known: the last groups are smaller, so that all workers end together.
-    """
-
-    def __init__(self, items: Iterable[Item], workers: int = 0, total: int | None = None) -> None:
-        self._items, self._workers, self._total = iter(items), workers, total
-        self._item_ns, self._taken = 0.0, 0
-
-    def learn(self, outcomes: Iterable[Outcome]) -> None:
-        """Take note of how long items took, but of those that could not be read."""
-        for took_ns in (outcome.total_ns for outcome in outcomes if outcome.total_ns):
-            self._item_ns = self._item_ns + _SHARE * (took_ns - self._item_ns) if self._item_ns else took_ns
-
-    def __iter__(self) -> Iterator[tuple[Item, ...]]:
-        while batch := self._next():
-            yield tuple(batch)
-            # The items are in memory as long as a variable has them.
-            del batch
-
-    def _next(self) -> list[Item]:
-        batch: list[Item] = []
-        most, size = self._most(), 0
-        while len(batch) < most and size < _MOST_BYTES:
-            item = next(self._items, None)
-            if item is None:
-                break
-            batch.append(item)
-            self._taken += 1
-            size += _bytes_of(item.payload.values())
-        return batch
-
-    def _most(self) -> int:
-        if not self._workers or not self._item_ns:
-            return 1
-        most = min(_MOST_ITEMS, int(_JOB_NS / self._item_ns))
-        if self._total is not None:
-            most = min(most, (self._total - self._taken) // (_LAST_JOBS * self._workers))
-        return max(1, most)
-
-
-def _bytes_of(values: Iterable[Any]) -> int:
-    return sum(size for value in values if isinstance(size := getattr(value, "nbytes", 0), int))

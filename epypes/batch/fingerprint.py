@@ -29,9 +29,11 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path, PurePath
 from typing import Any, Final
 
+from epypes.bundle.notebook_source import nested_codes
 from epypes.errors import MessageError
 from epypes.graph import CompGraph
 from epypes.run.guard import is_plain_array
+from epypes.run.snapshot import is_own
 from epypes.wire.encoder import ValueWriter
 from epypes.wire.protobuf import message_class
 
@@ -259,7 +261,7 @@ class Digester:
     def _globals(self, function: types.FunctionType) -> dict[str, Any]:
         """Return the globals that a function reads, and of modules of the user's what is read of them, by name."""
         found = function.__globals__
-        codes = list(_codes_in(function.__code__))
+        codes = list(nested_codes(function.__code__))
         attributes = {name for code in codes for name in code.co_names}
         names = {one.argval for code in codes for one in dis.get_instructions(code) if one.opname in _READS_NAME}
         by_text = sorted(_BY_TEXT.intersection(names) - found.keys())
@@ -410,15 +412,7 @@ _WAYS: Final[tuple[tuple[Any, Callable[[Digester, Any], None]], ...]] = (
 )
 
 
-def _codes_in(code: types.CodeType) -> Iterator[types.CodeType]:
-    """Yield a function's code, and that of the functions defined inside of it."""
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _codes_in(constant)
-
-
-_SINGLE_DISPATCH: Final = frozenset(_codes_in(functools.singledispatch.__code__))
+_SINGLE_DISPATCH: Final = frozenset(nested_codes(functools.singledispatch.__code__))
 
 
 def _lasting_state(value: Any, state: Any) -> Any:
@@ -454,13 +448,8 @@ def _annotations(function: types.FunctionType) -> Mapping[str, Any]:
 
 
 def _is_installed(module: str) -> bool:
-    root = module.partition(".")[0]
-    if root == "__main__":
-        return False
-    if root in sys.stdlib_module_names or root == _OURS:
-        return True
-    file = getattr(sys.modules.get(root), "__file__", None)
-    return file is not None and not _INSTALLED.isdisjoint(Path(file).parts)
+    # Without its cache: a module may be loaded again from another place.
+    return module != "__main__" and not is_own.__wrapped__(module.partition(".")[0])
 
 
 def versions_of(modules: Iterable[str], source: str = "") -> list[str]:

@@ -67,9 +67,9 @@ def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int 
         A name is not a hyperparameter of the runner.
     """
     _require_how(how, n)
-    if _is_listed(grid):
+    if _is_list_of(grid, Mapping):
         return _listed(runner, grid)
-    axes = dict.fromkeys(grid) if _are_names(grid) else grid
+    axes = dict.fromkeys(grid) if _is_list_of(grid, str) else grid
     if not isinstance(axes, Mapping) or not axes:
         raise ScaleError(
             f"grid is a mapping of hyperparameters to values, as {{'threshold': [50, 70]}}, not {grid!r:.60}."
@@ -79,7 +79,7 @@ def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int 
     if how in ("random", "latin"):
         return _drawn(runner, axes, how, n or 0, seed)
     values = {name: _values(runner, name, given) for name, given in axes.items()}
-    return _zipped(runner, values) if how == "zip" else _product(runner, values)
+    return _combined(runner, values, how)
 
 
 def require_hyperparameter(runner: CompGraphRunner, name: Any) -> None:
@@ -107,12 +107,8 @@ def _require_how(how: str, n: int | None) -> None:
 # -- a list of settings ---------------------------------------------------------------------------------------------
 
 
-def _is_listed(grid: Any) -> bool:
-    return isinstance(grid, list | tuple) and bool(grid) and all(isinstance(one, Mapping) for one in grid)
-
-
-def _are_names(grid: Any) -> bool:
-    return isinstance(grid, list | tuple) and bool(grid) and all(isinstance(one, str) for one in grid)
+def _is_list_of(grid: Any, kind: type) -> bool:
+    return isinstance(grid, list | tuple) and bool(grid) and all(isinstance(one, kind) for one in grid)
 
 
 def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
@@ -167,36 +163,23 @@ def _hint(runner: CompGraphRunner, name: str) -> Param:
     )
 
 
-def _product(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Grid:
-    names, size = tuple(values), math.prod(map(len, values.values()))
-
-    def settings() -> tuple[Setting, ...]:
-        return tuple(dict(zip(names, row, strict=True)) for row in product(*values.values()))
-
-    return _checked(runner, values, Grid(names, size, settings))
-
-
-def _zipped(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Grid:
+def _combined(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]], how: str) -> Grid:
+    """Return the grid of each value with each other, or of the first values of all, the second ones, and so on."""
     lengths = {name: len(given) for name, given in values.items()}
-    if len(set(lengths.values())) > 1:
+    if how == "zip" and len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ScaleError(
             f"how='zip' takes the first values together, then the second, and so on, but {counts}. "
             "Give as many of each."
         )
-    names = tuple(values)
-
-    def settings() -> tuple[Setting, ...]:
-        return tuple(dict(zip(names, row, strict=True)) for row in zip(*values.values(), strict=True))
-
-    return _checked(runner, values, Grid(names, next(iter(lengths.values())), settings))
-
-
-def _checked(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]], grid: Grid) -> Grid:
-    if grid.size <= MOST_OUTCOMES:
+    size = max(lengths.values()) if how == "zip" else math.prod(lengths.values())
+    if size <= MOST_OUTCOMES:
         for name, given in values.items():
             _require_branches(runner, name, given)
-    return grid
+    combine: Callable[..., Iterable[tuple[Any, ...]]] = zip if how == "zip" else product
+    return Grid(
+        tuple(values), size, lambda: tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
+    )
 
 
 def _require_branches(runner: CompGraphRunner, name: str, values: Iterable[Any]) -> None:

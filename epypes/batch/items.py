@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from epypes.acquisition.files import IMAGE_ENDINGS, image_files, natural_order, read_image
 from epypes.bundle.clone import clone_runner
@@ -16,10 +16,6 @@ from epypes.errors import ScaleError
 from epypes.graph import CompGraph, colour_order
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array, is_plain_array
-
-if TYPE_CHECKING:
-    from epypes.graph import CompGraph
-
 
 _KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
 _SHOWN: Final = "*?["

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Final
 
 from epypes.batch.items import Item, payload_of
-from epypes.batch.results import ErrorInfo, Outcome, is_endless, long_number, plain_number
+from epypes.batch.results import ErrorInfo, Outcome, scalar
 from epypes.batch.thumbnails import Album
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.shown import Look
@@ -151,13 +153,9 @@ def _error_info(failure: Failure) -> ErrorInfo:
 
 def _value(value: Any) -> Any:
     """Return a value as a table shows it."""
-    if type(value) is int and is_endless(value):
-        return long_number(value)
+    value = scalar(value)
     if value is None or type(value) in (bool, int, float, str):
         return value
-    number = plain_number(value)
-    if number is not None:
-        return number
     return str(value) if isinstance(value, str) else sketch(value, Look()).shown.text
 
 
@@ -190,7 +188,42 @@ class SharedStart:
             self._runner = None if begun is None else branched(begun)
             return begun
 
+    @property
+    def nbytes(self) -> int:
+        """How many bytes the arrays of the run have."""
+        last = None if self._runner is None else self._runner.last
+        if last is None:
+            return 0
+        values = (last[token] for token in last.cg.tokens if last.tokens.is_readable(token))
+        return sum(getattr(value, "nbytes", 0) for value in values)
+
     def move_to(self, runner: CompGraphRunner) -> None:
         """Let the next job branch from this runner's last run."""
         with self._lock:
             self._runner = branched(runner)
+
+
+class RunnerPool:
+    """Runners for the threads of a pool, each used by one thread at a time.
+
+    Parameters
+    ----------
+    make
+        Returns a new runner; called when no runner is idle.
+    """
+
+    def __init__(self, make: Callable[[], CompGraphRunner]) -> None:
+        self._make = make
+        self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
+
+    @contextmanager
+    def runner(self) -> Iterator[CompGraphRunner]:
+        """Yield a runner that no other thread uses meanwhile."""
+        try:
+            own = self._idle.get_nowait()
+        except queue.Empty:
+            own = self._make()
+        try:
+            yield own
+        finally:
+            self._idle.put(own)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 from epypes.batch.cache import OutcomeCache, outcome_cache
-from epypes.batch.executors import JobSizes, run_jobs, worker_count
+from epypes.batch.executors import run_jobs
 from epypes.batch.items import Item, count_of, detached_runner, items_of
 from epypes.batch.job import NO_SETTING, Job, Setting
 from epypes.batch.progress import Advance, progress_bar
@@ -150,10 +150,9 @@ def map_images(
     ):
         collector = OutcomeCollector(cache, advance)
         items = items_of(images, runner, is_copied=executor is not None or cache is not None or bool(keep))
-        batches = JobSizes(collector.missing_items(items), 0 if executor is None else worker_count(executor), count)
-        jobs = (Job(batch, keep=tuple(keep), show=None if show is None else tuple(show)) for batch in batches)
+        shown = None if show is None else tuple(show)
+        jobs = (Job((item,), keep=tuple(keep), show=shown) for item in collector.missing_items(items))
         for outcomes in run_jobs(runner, jobs, executor, ahead=ahead):
-            batches.learn(outcomes)
             collector.add(outcomes)
     return MapResult(runner.cg, sorted(collector.outcomes, key=lambda outcome: outcome.number))
 
@@ -185,7 +184,7 @@ class OutcomeCollector:
         """Return the settings with which an item has to be run; take the stored outcomes of the others."""
         if self._cache is None:
             return settings
-        found = [self._cache.find(item, setting) for setting in settings]
+        found = self._cache.found(item, settings)
         self._take([outcome for outcome in found if outcome is not None])
         return tuple(setting for setting, outcome in zip(settings, found, strict=True) if outcome is None)
 

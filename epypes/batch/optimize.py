@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.batch.cache import (
+    NoDigest,
+    function_digest,
+    graph_fingerprint,
+    payload_digest,
+    source_of,
+    value_digest,
+)
 from epypes.batch.cases import Case, cases_of, with_labels_read
-from epypes.batch.executors import run_jobs, worker_count
-from epypes.batch.incremental import CaseRunners, SearchStopped
+from epypes.batch.executors import run_jobs, runs_here, worker_count
+from epypes.batch.fingerprint import combined_digest
 from epypes.batch.items import Item, detached_runner, items_of
-from epypes.batch.job import Job
-from epypes.batch.objective import Objective, ObjectiveMetric, Score, code_digests, search_digests, search_name
+from epypes.batch.job import Job, SharedStart
 from epypes.batch.progress import progress_bar
-from epypes.batch.ranges import axes_of
+from epypes.batch.ranges import Axis, ChoiceAxis, axes_of
 from epypes.batch.results import Outcome
 from epypes.batch.search_result import OptimizeResult
 from epypes.batch.study import Direction, Search, Suggestion, Trial
-from epypes.errors import ScaleError
+from epypes.errors import EpypesError, ScaleError
+from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
 from epypes.wording import ended
@@ -29,7 +39,11 @@ from epypes.wording import ended
 if TYPE_CHECKING:
     from epypes.store import Store
 
+# Of the values that are held between settings; further cases run from their files or arrays each time.
+MOST_BYTES: Final = 2**30
 _CASE_FILE: Final = ".toml"
+ObjectiveMetric = Callable[[Mapping[str, Any], Case], Any] | str
+_REASON_CHARACTERS: Final = 300
 _DIRECTIONS: Final = ("maximize", "minimize")
 
 
@@ -67,8 +81,8 @@ def optimize(
         How many trials there are to be: with a store, those that are in there already count.
     executor
         Runs the cases, as for ``ep.map``; several trials then run at a time, so the settings that are tried depend on
-        the order in which trials end. Without, the calling thread does, and runs of each case only what depends on what
-        has changed.
+        the order in which trials end. Threads, and the calling thread without, run of each case only what depends on
+        what has changed.
     direction
         ``"maximize"`` or ``"minimize"``.
     ranges
@@ -86,7 +100,7 @@ def optimize(
         searched, from what the metric computes, and from the cases: what goes into them, their labels and their
         hyperparameters. A study that has been searched for another one of these is refused.
     stop
-        Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. The trials
+        Ends the search once it is set: when the case that runs has ended. So does Ctrl+C, at once. The trials
         that have ended until then are returned.
     on_trial
         Is called with each ``Trial`` that has ended, by the thread that calls this.
@@ -172,45 +186,43 @@ class _Evaluation:
     def is_stopped(self) -> bool:
         return self.stop is not None and self.stop.is_set()
 
-    @property
-    def own(self) -> list[Mapping[str, Any]]:
-        """The hyperparameters of each case that are its own."""
-        return [case.hyperparameters or {} for case in self.objective.cases]
-
     def scores(self, search: Search, count: int) -> Generator[tuple[Suggestion, Score]]:
         """Yield the scores of the next settings as they come; fewer if the search is stopped."""
-        asked = (search.ask() for _ in range(count))
-        return self._in_this_thread(asked) if self.executor is None else self._on_executor(asked, self.executor)
-
-    def _in_this_thread(self, asked: Iterator[Suggestion]) -> Generator[tuple[Suggestion, Score]]:
-        runners = CaseRunners(self.runner, self.items, self.own, self.objective.keep, self.stop)
-        while not self.is_stopped and (one := next(asked, None)) is not None:
-            try:
-                score = self.objective.score(runners.outcomes(one.setting))
-            except SearchStopped:
-                return
-            yield one, score
-
-    def _on_executor(self, asked: Iterator[Suggestion], executor: Executor) -> Generator[tuple[Suggestion, Score]]:
         pending: dict[int, tuple[Suggestion, dict[int, Outcome]]] = {}
-        keep, count = self.objective.keep, len(self.items)
+        # In this process each case goes on from its last run, as far as memory is for that.
+        starts = [SharedStart() if runs_here(self.executor) else None for _ in self.items]
+        measured: set[int] = set()
+        held_bytes = 0
 
         def jobs() -> Iterator[Job]:
             """Yield a job for each case of each trial, when there is room; a trial is asked for with its first."""
-            for number, one in enumerate(asked):
+            keep = self.objective.keep
+            for number in range(count):
+                one = search.ask()
                 pending[number] = one, {}
-                for item, own in zip(self.items, self.own, strict=True):
-                    marked = Item(number * count + item.number, item.name, item.payload)
-                    yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
+                for item, case, index in zip(self.items, self.objective.cases, range(len(starts)), strict=True):
+                    if number not in pending:  # a case before has failed
+                        break
+                    marked = replace(item, number=number * len(starts) + index)
+                    setting = {**one.setting, **(case.hyperparameters or {})}
+                    yield Job((marked,), (setting,), keep=keep, start=starts[index], targets=keep)
 
-        for outcomes in run_jobs(self.runner, jobs(), executor, ahead=worker_count(executor), stop=self.stop):
-            for outcome in outcomes:
-                number, index = divmod(outcome.number, count)
+        ahead = None if self.executor is None else worker_count(self.executor)
+        for [outcome] in filter(None, run_jobs(self.runner, jobs(), self.executor, ahead=ahead, stop=self.stop)):
+            number, index = divmod(outcome.number, len(starts))
+            start = starts[index]
+            if start is not None and index not in measured:
+                measured.add(index)
+                held_bytes += start.nbytes
+                if held_bytes > MOST_BYTES:
+                    held_bytes -= start.nbytes
+                    starts[index] = None
+            if number in pending:
                 one, found = pending[number]
                 found[index] = outcome
-                if len(found) == count:
+                if len(found) == len(starts) or outcome.has_failed:
                     del pending[number]
-                    yield one, self.objective.score([found[index] for index in range(count)])
+                    yield one, self.objective.score(found)
 
 
 def _searched(
@@ -239,3 +251,180 @@ def _searched(
         except KeyboardInterrupt:
             return True
     return work.is_stopped
+
+
+# -- the objective ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """The result of one setting over all cases.
+
+    Attributes
+    ----------
+    value
+        The metric, averaged over the cases; None if one of them failed.
+    failure
+        The case that failed, and the reason; empty if none did.
+    total_ns
+        Nanoseconds of the functions that ran.
+    unreadable
+        The reason if a file of a case can't be read: no other setting gives anything either. Empty otherwise.
+    """
+
+    value: float | None
+    failure: str
+    total_ns: int
+    unreadable: str = ""
+
+
+class Objective:
+    """Measures outcomes.
+
+    Parameters
+    ----------
+    cg
+        The graph.
+    metric
+        ``metric(tokens, case)`` is called with the kept tokens of a run and its case, on the thread of the caller; or
+        the name of a token that is a number.
+    cases
+        What is run.
+    keep
+        The tokens that the metric is given; all sink tokens without.
+
+    Raises
+    ------
+    ScaleError
+        The metric is neither a function nor a name.
+    UnknownName
+        The graph has no such token.
+    """
+
+    def __init__(
+        self, cg: CompGraph, metric: ObjectiveMetric, cases: Sequence[Case], keep: Sequence[str] | None = None
+    ) -> None:
+        if not isinstance(metric, str) and not callable(metric):
+            kind = type(metric).__name__
+            raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
+        self.cases = tuple(cases)
+        self._metric = metric
+        self.keep: tuple[str, ...]
+        if isinstance(metric, str):
+            self.name, self.keep = metric, (metric,)
+        else:
+            self.name = getattr(metric, "__name__", "metric")
+            self.keep = cg.sink_tokens if keep is None else tuple(keep)
+        for token in self.keep:
+            cg.require_token(token)
+
+    def score(self, outcomes: Mapping[int, Outcome]) -> Score:
+        """Return the score of a setting by its outcomes, by place of the case; it ends at the first failure."""
+        values: list[float] = []
+        spent_ns = 0
+        for index, outcome in sorted(outcomes.items()):
+            case = self.cases[index]
+            spent_ns += outcome.total_ns
+            error = outcome.error_info
+            value, failure = self._measured(case, outcome) if error is None else (math.nan, str(error))
+            if failure:
+                where = f"{case.name}: " if len(self.cases) > 1 and case.name else ""
+                unreadable = error.message if error is not None and error.is_unreadable else ""
+                return Score(None, f"{where}{failure}"[:_REASON_CHARACTERS], spent_ns, unreadable)
+            values.append(value)
+        return Score(math.fsum(values) / len(values), "", spent_ns)
+
+    def _measured(self, case: Case, outcome: Outcome) -> tuple[float, str]:
+        """Return the metric of one case, and the reason if there is none."""
+        tokens, metric = MappingProxyType(dict(outcome.kept)), self._metric
+        try:
+            given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
+        except (Exception, SystemExit) as error:
+            return math.nan, f"{self.name} raised {type(error).__name__}: {error}"
+        try:
+            value = float(given)
+        except (TypeError, ValueError, OverflowError):
+            return math.nan, f"{self.name} gave a {type(given).__name__!r}, no number"
+        return value, "" if math.isfinite(value) else f"{self.name} gave {value}"
+
+    def digest(self) -> str:
+        """Return the digest of the metric and of what it is given.
+
+        Raises
+        ------
+        NoDigest
+            The metric reaches something without a digest, such as a generator.
+        """
+        metric = "token" if isinstance(self._metric, str) else function_digest(self._metric)
+        return combined_digest("metric", metric, *self.keep).hex()
+
+
+# -- which search it is -----------------------------------------------------------------------------------------
+
+
+def code_digests(runner: CompGraphRunner, objective: Objective, *, is_named: bool) -> dict[str, str]:
+    """Return the digests of the graph and of the metric; see ``search_digests``."""
+    return _digests({"graph": lambda: _graph_digest(runner.cg), "metric": objective.digest}, is_named=is_named)
+
+
+def search_digests(
+    runner: CompGraphRunner, axes: Sequence[Axis], objective: Objective, items: Sequence[Item], *, is_named: bool
+) -> dict[str, str]:
+    """Return digests of all that decides about the trials of a search, by what they are of.
+
+    Parameters
+    ----------
+    runner
+        Its graph and the hyperparameters that do not vary.
+    axes
+        What varies.
+    objective
+        The metric and the cases.
+    items
+        The inputs of the cases.
+    is_named
+        Whether the user has given the search a name; what has no digest has "" then.
+
+    Raises
+    ------
+    ScaleError
+        Something has no digest, and the search no name.
+    """
+    varied = {axis.token for axis in axes}
+    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
+    choices = {axis.token: axis.choices for axis in axes if isinstance(axis, ChoiceAxis)}
+    labels = [(case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases]
+    data = {
+        "hyperparameters": lambda: value_digest(fixed),
+        "choices": lambda: value_digest(choices),
+        "inputs of the cases": lambda: value_digest([(item.name, payload_digest(item.payload)) for item in items]),
+        "labels of the cases": lambda: value_digest(labels),
+    }
+    return code_digests(runner, objective, is_named=is_named) | _digests(data, is_named=is_named)
+
+
+def search_name(metric: str, direction: str, axes: Sequence[Axis], digests: Mapping[str, str]) -> str:
+    """Return the name of a search that the user has not named: a digest of what it computes."""
+    ranges = [axis.labels if isinstance(axis, ChoiceAxis) else repr(axis) for axis in axes]
+    text = repr((direction, [axis.token for axis in axes], ranges, sorted(digests.items())))
+    return f"optimize {metric} {combined_digest('search', text).hex()[:12]}"
+
+
+def _digests(ways: Mapping[str, Callable[[], str]], *, is_named: bool) -> dict[str, str]:
+    found = {}
+    for what, way in ways.items():
+        try:
+            found[what] = way()
+        except (EpypesError, NoDigest) as error:
+            if not is_named:
+                text = f"What is searched has no name for the store. Nothing tells its {what} from others: {error}"
+                raise ScaleError(f"{text}.\nGive one: name='...'.") from error
+            found[what] = ""
+    return found
+
+
+def _graph_digest(cg: CompGraph) -> str:
+    found = graph_fingerprint(cg, source_of(cg))
+    if found.unknown:
+        raise NoDigest(found.unknown)
+    return combined_digest("graph", found.code, found.state).hex()

@@ -1,4 +1,4 @@
-"""A graph as a bundle that travels to other processes, and the serialization of the values beside it.
+"""A graph as a bundle that travels to other processes, the serialization of values, and the worker side that runs jobs.
 
 The graph is promoted once, which proves that it computes there what it computes here, and the bundle's files travel.
 Numbers, texts, paths and plain arrays travel as they are; any other value by wire's codecs, which know what pickle does
@@ -8,7 +8,9 @@ not, such as OpenCV's keypoints. Nothing of the notebook is ever pickled.
 from __future__ import annotations
 
 import functools
+import os
 import re
+import socket
 import tempfile
 import threading
 from collections import OrderedDict
@@ -17,16 +19,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
-from epypes.batch.cache import combined_digest, source_of
-from epypes.batch.job import Job
+from epypes.batch.cache import source_of
+from epypes.batch.fingerprint import combined_digest
+from epypes.batch.job import Job, RunnerPool, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
 from epypes.bundle.hyperparameters import Unwritable, members_in, read, written
-from epypes.bundle.load import SAMPLES
+from epypes.bundle.load import SAMPLES, Bundle, read_bundle
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array
 from epypes.wire import Envelope, decode, encode
+from epypes.wording import ended
 
 _NAME: Final = "graph"
 # Stands in the reasons in place of the temporary folder.
@@ -216,3 +220,105 @@ def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
                 value.flags.writeable = False
         unpacked.append(replace(outcome, setting=job.settings[place % len(job.settings)], kept=kept))
     return unpacked
+
+
+# -- the worker side ----------------------------------------------------------------------------------------------
+
+_MOST_LOADED: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class PackagedJob:
+    """A job as it travels to a worker process.
+
+    Attributes
+    ----------
+    id
+        Another one each time, since a Dask cluster takes equal calls for one.
+    package
+        The graph.
+    hyperparameters
+        The runner's, packed.
+    job
+        The job, packed.
+    workers, guard, check_mutation
+        Options of the runner.
+    """
+
+    id: str
+    package: PackagedGraph
+    hyperparameters: Mapping[str, Any]
+    job: Job
+    workers: int = 1
+    guard: bool = True
+    check_mutation: bool = False
+
+    def __dask_tokenize__(self) -> str:
+        return self.id
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerRefusal:
+    """Why a worker process can't run a job; ``needs_files``: it has not unpacked the package yet."""
+
+    reason: str
+    needs_files: bool = False
+
+
+class _LoadedGraph:
+    """A bundle that was unpacked in this process, and the runners of it that are idle."""
+
+    def __init__(self, bundle: Bundle, packaged: PackagedJob) -> None:
+        self._enums = bundle.enums
+        values = unpacked_values(packaged.hyperparameters, bundle.enums)
+        options = {name: getattr(packaged, name) for name in ("workers", "guard", "check_mutation")}
+        self._runners = RunnerPool(lambda: CompGraphRunner(bundle.cg, values, **options))
+
+    def run(self, packaged: PackagedJob) -> list[Outcome]:
+        """Run a job, on a runner that no other thread uses meanwhile."""
+        with self._runners.runner() as own:
+            own.set(**unpacked_values(packaged.hyperparameters, self._enums))
+            return run_job(own, unpacked_job(packaged.job, self._enums))
+
+
+_LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _LoadedGraph]] = OrderedDict()
+_LOAD_LOCK: Final = threading.Lock()
+
+
+def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | WorkerRefusal:
+    """Run a job in this worker process; the executor calls it."""
+    key = packaged.package.digest, packaged.workers, packaged.guard, packaged.check_mutation
+    with _LOAD_LOCK:
+        loaded = _LOADED.get(key)
+        if loaded is None:
+            if packaged.package.files is None:
+                return WorkerRefusal("the files of the bundle are missing", needs_files=True)
+            try:
+                loaded = _LoadedGraph(_unpacked(packaged.package.files), packaged)
+            except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
+                return WorkerRefusal(_load_error(packaged.package, error))
+            _LOADED[key] = loaded
+            while len(_LOADED) > _MOST_LOADED:
+                _LOADED.popitem(last=False)
+    try:
+        return packed_outcomes(loaded.run(packaged))
+    except ScaleError as error:
+        return WorkerRefusal(str(error))
+
+
+def _unpacked(files: Mapping[str, bytes]) -> Bundle:
+    with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
+        for name, content in files.items():
+            file = Path(folder) / "graph" / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+        # Its digest has come with it, and what was left out is in its manifest.
+        return read_bundle(Path(folder) / "graph", sealed=False)
+
+
+def _load_error(package: PackagedGraph, error: BaseException) -> str:
+    where = f"Worker process {os.getpid()} on {socket.gethostname()}"
+    needs = ", ".join(line for line in package.requirements.splitlines() if line and not line.startswith("#"))
+    way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
+    reason = ended(f"{type(error).__name__}: {error}")
+    return f"{where} can't load the graph: {reason} {way_out}; or use an executor of this machine."

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import Any, Final
 
-from epypes.errors import MissingPackage
 from epypes.optional import optional_import
 
 # Takes how many more are done, and how many of these have failed.
@@ -29,17 +29,12 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
     unit
         What is counted.
     """
-    if progress is False or (progress is None and not _is_seen()):
-        yield _show_nothing
+    is_seen = find_spec("tqdm") is not None and _is_seen() if progress is None else progress
+    if not is_seen:
+        yield lambda count, failures: None
         return
-    try:
-        with optional_import():
-            from tqdm import tqdm
-    except MissingPackage:
-        if progress:
-            raise
-        yield _show_nothing
-        return
+    with optional_import():
+        from tqdm import tqdm
     failed = 0
     with tqdm(total=total, desc=what, unit=unit, file=_Cell() if _is_in_notebook() else sys.stderr) as bar:
 
@@ -79,10 +74,6 @@ class _Cell:
 
     def flush(self) -> None:
         """Do nothing: each line is shown at once."""
-
-
-def _show_nothing(count: int, failures: int) -> None:
-    """Take the numbers, where there is no bar."""
 
 
 def _is_seen() -> bool:

@@ -153,36 +153,24 @@ class Outcome:
 
 
 def _json_value(value: Any) -> Any:
-    """Return a hyperparameter's value as JSON can hold it, for people and tables: it is not read back."""
-    if isinstance(value, int) and is_endless(value):
-        return long_number(value)
+    """Return a value of a setting as JSON; it is not read back."""
+    value = scalar(value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, tuple | list):
-        return [_json_value(item) for item in value]
-    number = plain_number(value)
-    return str(value) if number is None else number
+    return [_json_value(item) for item in value] if isinstance(value, tuple | list) else str(value)
 
 
-def is_endless(value: int) -> bool:
-    """Whether a number has more digits than Python may be configured to convert."""
-    return value.bit_length() > _MOST_BITS
-
-
-def long_number(value: int) -> str:
-    """Return the text that a table shows in place of a very long number."""
-    return f"int of {value.bit_length():,} bits"
-
-
-def plain_number(value: Any) -> bool | int | float | None:
-    """Return numpy's numbers and truth values as Python's; None for what is neither."""
+def scalar(value: Any) -> Any:
+    """Return a number or truth value of numpy as Python's, and a very long number as text; anything else as it is."""
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        return f"int of {value.bit_length():,} bits"
     if getattr(value, "shape", None) != () or not hasattr(value, "item"):
-        return None
+        return value
     item = value.item()
-    return item if isinstance(item, bool | int | float) else None
+    return item if isinstance(item, bool | int | float) else value
 
 
-_FIXED: Final = ("name", "failure", "total_ms")
+FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 def outcomes_frame(
@@ -213,13 +201,18 @@ def outcomes_frame(
     tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
     functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
     for token in tokens:
-        is_taken = token in columns or token in _FIXED
+        is_taken = token in columns or token in FIXED_COLUMNS
         columns[f"{token} (token)" if is_taken else token] = _column(
             [outcome.values.get(token) for outcome in outcomes]
         )
     columns["total_ms"] = [outcome.total_ns / 1e6 for outcome in outcomes]
     for function in functions:
         columns[f"{function} ms"] = [_in_ms(outcome.times_ns.get(function)) for outcome in outcomes]
+    return frame_of(columns)
+
+
+def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
+    """Return a pandas table of columns by name."""
     with optional_import():
         import pandas as pd
     return pd.DataFrame(columns)
@@ -264,7 +257,7 @@ _MOST_ROWS: Final = 30
 _THUMBNAIL_CHARACTERS: Final = 80_000
 _MESSAGE_CHARACTERS: Final = 160
 _ERROR: Final = "var(--jp-error-color1,var(--vscode-errorForeground,#cf222e))"
-_LEFT: Final = ' style="text-align:left"'
+LEFT: Final = ' style="text-align:left"'
 
 
 def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
@@ -273,12 +266,12 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in chosen)]
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
-    head = _row("th", ["name", *shown, *sinks, "time"])
-    room, rows = _THUMBNAIL_CHARACTERS, []
-    for outcome in chosen:
-        pictures = [_picture(outcome.thumbnails.get(token)) for token in shown]
-        room -= sum(map(len, pictures))
-        rows.append(_outcome_row(outcome, pictures if room >= 0 else [""] * len(shown), sinks))
+    head = html_row("th", ["name", *shown, *sinks, "time"])
+    pictures = Pictures()
+    rows = [
+        _outcome_row(outcome, [pictures.image(outcome.thumbnails.get(token)) for token in shown], sinks)
+        for outcome in chosen
+    ]
     left_out = len(outcomes) - len(chosen)
     more = f"<p>and {left_out} more: to_frame() has all of them</p>" if left_out else ""
     return f"<table><caption>{content(caption)}</caption>{head}{''.join(rows)}</table>{more}"
@@ -297,25 +290,36 @@ def _outcome_row(outcome: Outcome, pictures: list[str], sinks: Sequence[str]) ->
     name = content(outcome.name)
     if outcome.error_info is None:
         values = [content(value_text(outcome.values[token])) if token in outcome.values else "" for token in sinks]
-        return _row("td", [name, *pictures, *values, duration_text(outcome.total_ns)])
+        return html_row("td", [name, *pictures, *values, duration_text(outcome.total_ns)])
     message = " ".join(str(outcome.error_info).split())
     cut = message if len(message) <= _MESSAGE_CHARACTERS else f"{message[:_MESSAGE_CHARACTERS]}..."
     style = f'style="text-align:left;color:{_ERROR}" title="{escape(message)}"'
     failure = f'<td colspan="{len(sinks) + 1}" {style}>\u2717 {content(cut)}</td>'
-    cells = "".join(f"<td{_LEFT}>{cell}</td>" for cell in (name, *pictures))
+    cells = "".join(f"<td{LEFT}>{cell}</td>" for cell in (name, *pictures))
     return f"<tr>{cells}{failure}</tr>"
 
 
-def _row(kind: str, cells: Iterable[str]) -> str:
-    return f"<tr>{''.join(f'<{kind}{_LEFT}>{cell}</{kind}>' for cell in cells)}</tr>"
+def html_row(tag: str, cells: Iterable[str]) -> str:
+    """Return a row of an HTML table; the cells are HTML."""
+    return f"<tr>{''.join(f'<{tag}{LEFT}>{cell}</{tag}>' for cell in cells)}</tr>"
 
 
-def _picture(shown: Thumbnail | None) -> str:
-    return (
-        ""
-        if shown is None
-        else f'<img src="{data_uri(shown)}" alt="{escape(shown.caption)}" title="{escape(shown.caption)}">'
-    )
+class Pictures:
+    """The pictures of one page, as far as there is room for them."""
+
+    def __init__(self) -> None:
+        self._room = _THUMBNAIL_CHARACTERS
+
+    def image(self, shown: Thumbnail | None, alt: str = "") -> str:
+        """Return a picture as HTML, with a text instead of its caption if one is given; "" without room for it."""
+        if shown is None:
+            return ""
+        text = escape(alt or shown.caption)
+        element = f'<img src="{data_uri(shown)}" alt="{text}" title="{text}">'
+        if len(element) > self._room:
+            return ""
+        self._room -= len(element)
+        return element
 
 
 def data_uri(shown: Thumbnail) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.ranges import Axis
-from epypes.batch.results import object_column
+from epypes.batch.results import frame_of, object_column
 from epypes.batch.study import Direction, Trial, importances, quiet_optuna
 from epypes.display.durations import duration_text
 from epypes.display.markup import content, cut, cut_name, escape
@@ -15,7 +15,6 @@ from epypes.display.paint.rows import Table
 from epypes.display.paint.style import STYLE, page_style, paper_style
 from epypes.display.paint.tables import paint_table
 from epypes.errors import ScaleError
-from epypes.optional import optional_import
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -143,9 +142,7 @@ class OptimizeResult:
         columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
         columns["failure"] = object_column([trial.failure or None for trial in self.trials])
         columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
-        with optional_import():
-            import pandas as pd
-        return pd.DataFrame(columns)
+        return frame_of(columns)
 
     def history_plot(self) -> Figure:
         """Draw the value of each trial that completed, and the best one so far, as Optuna does with Matplotlib."""

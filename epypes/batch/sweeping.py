@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cache import outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of
-from epypes.batch.executors import run_jobs, worker_count
+from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Grid, Setting, functions_after, grid_of, running_order, steps
 from epypes.batch.items import Item, count_of, detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import OutcomeCollector
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, outcomes_frame
+from epypes.batch.results import FIXED_COLUMNS, Outcome, outcomes_frame
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.run import CompGraphRunner
 from epypes.store import Store
@@ -31,7 +31,6 @@ _MOST_PICTURES: Final = 200_000
 # Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
 _PARTS: Final = 16
 _MOST_SETTINGS: Final = 256
-_FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +72,7 @@ class SweepResult:
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
         varied = {
-            f"{name} (hyperparameter)" if name in _FIXED_COLUMNS else name: [
+            f"{name} (hyperparameter)" if name in FIXED_COLUMNS else name: [
                 one.setting.get(name) for one in self.outcomes
             ]
             for name in self.names
@@ -215,7 +214,7 @@ def _jobs(
     for item in items:
         settings = collector.missing_settings(item, grid_job.settings)
         cuts = _cuts(runner, settings, executor, images) if settings else []
-        start = SharedStart() if len(cuts) > 2 and _is_here(executor) else None
+        start = SharedStart() if len(cuts) > 2 and runs_here(executor) else None
         for first, end in pairwise(cuts):
             yield replace(grid_job, items=(item,), settings=settings[first:end], start=start)
         # This generator waits for its caller, and must not keep the item alive meanwhile.
@@ -270,10 +269,6 @@ def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
 # -- parts of a grid ------------------------------------------------------------------------------------------------
 
 
-def _is_here(executor: Executor | None) -> bool:
-    return executor is None or isinstance(executor, ThreadPoolExecutor)
-
-
 def _cuts(
     runner: CompGraphRunner, settings: Sequence[Setting], executor: Executor | None, images: int | None
 ) -> list[int]:
@@ -286,7 +281,7 @@ def _cuts(
         # Outside of this process each part computes what all have in common: there are only as many as keep all
         # workers at work.
         parts = -(-workers // max(images or workers, 1))
-        parts *= _PARTS if parts > 1 and _is_here(executor) else 1
+        parts *= _PARTS if parts > 1 and runs_here(executor) else 1
         # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
         places = steps(runner.cg, settings)
         places = places if len(places) >= workers else list(range(len(settings)))

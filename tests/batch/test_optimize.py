@@ -21,7 +21,6 @@ import pytest
 from matplotlib import pyplot
 
 import epypes as ep
-from epypes.batch import incremental
 from epypes.batch.ranges import ChoiceAxis
 from epypes.batch.search_result import OptimizeResult
 from epypes.batch.study import Trial
@@ -227,10 +226,23 @@ def test_cases_that_do_not_fit_into_memory_are_run_anew(
     cases, ranges = [np.full((30, 30), 1), np.full((2, 2), 5)], {"k": (0, 9)}
     kept = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     calls["heavy"] = 0
-    monkeypatch.setattr(incremental, "MOST_BYTES", 1_000)
+    monkeypatch.setattr("epypes.batch.optimize.MOST_BYTES", 1_000)
     anew = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     assert calls["heavy"] == 8 + 1, "the small one is kept"
     assert [trial.value for trial in anew] == [trial.value for trial in kept]
+
+
+def test_a_trial_ends_at_the_first_case_that_fails() -> None:
+    called = []
+
+    def divide(x: int, k: int) -> float:
+        called.append((x, k))
+        return x / k
+
+    cg = ep.CompGraph({"divide": divide}, {"divide": (("x", "k"), "y")})
+    result = ep.optimize(ep.CompGraphRunner(cg, {"k": 0}), "y", [1, 2, 3], 8, ranges={"k": (0, 1)})
+    assert set(called) == {(1, 0), (1, 1), (2, 1), (3, 1)}
+    assert "ZeroDivisionError" in result[0].failure
 
 
 def test_threads_give_the_values_that_one_thread_gives(runner: ep.CompGraphRunner) -> None:
@@ -391,7 +403,7 @@ def test_a_runner_without_ranges_is_refused_with_the_way_out() -> None:
 # -- stopping ---------------------------------------------------------------------------------------------------
 
 
-def test_a_stop_waits_for_no_more_than_the_function_that_runs() -> None:
+def test_a_stop_waits_for_no_more_than_the_case_that_runs() -> None:
     stop, called = threading.Event(), []
 
     def first(x: int, k: int) -> int:
@@ -406,7 +418,7 @@ def test_a_stop_waits_for_no_more_than_the_function_that_runs() -> None:
 
     cg = ep.CompGraph({"first": first, "second": second}, {"first": (("x", "k"), "f"), "second": ("f", "y")})
     result = ep.optimize(ep.CompGraphRunner(cg, {"k": 0}), "y", [0], 1_000, ranges={"k": (0, 10**6)}, stop=stop)
-    assert (called[-1], len(result), result.was_stopped) == ("first", 3, True)
+    assert (len(called), len(result), result.was_stopped) == (8, 4, True)
 
 
 def test_a_stop_reaches_threads_too(runner: ep.CompGraphRunner) -> None:

@@ -129,7 +129,7 @@ class Searching:
         return True
 
     def stop(self) -> None:
-        """Have the search end when the function that runs has returned; return at once."""
+        """Have the search end when the case that runs has ended; return at once."""
         with self._lock:
             if not self.is_running or self._stop.is_set():
                 return

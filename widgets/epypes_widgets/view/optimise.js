@@ -14,7 +14,7 @@ export function optimisePart(panel) {
   const goal = element("span", "epypes-goal");
   const count = element("input", "epypes-input epypes-trials", { type: "number", min: "1", max: String(MOST_N), step: "1", "aria-label": "Number of trials", title: "Number of trials" });
   const start = textButton("Optimise", onStart, "epypes-search-start", "Search the values of all hyperparameters within their ranges");
-  const stop = textButton("Stop", onStop, "epypes-search-stop", "Stop when the function that runs has returned");
+  const stop = textButton("Stop", onStop, "epypes-search-stop", "Stop when the case that runs has ended");
   const use = textButton("Use best", onUse, "epypes-search-use", "Set the best values; undo goes back");
   const said = element("span", "epypes-said epypes-search-said", { role: "status" });
   const setting = element("div", "epypes-search-setting");
