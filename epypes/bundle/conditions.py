@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -115,3 +116,18 @@ def _another_locale() -> str:
     plain = "C.UTF-8" if now in ("C", "POSIX") else "C"
     others = (name for name in installed if not name.startswith(("C", "POSIX", "en", now[:2])))
     return next(others, plain)
+
+
+def library_settings() -> dict[str, str]:
+    """Return how libraries are set in this process, where that changes what functions compute."""
+    found: dict[str, str] = {}
+    numpy, cv2, decimal = (sys.modules.get(name) for name in ("numpy", "cv2", "decimal"))
+    if numpy is not None:
+        raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
+        found["numpy.seterr"] = f"{raising or 'no errors are raised'}"
+    if cv2 is not None:
+        found["cv2.setUseOptimized"] = f"{cv2.useOptimized()}"
+    if decimal is not None:
+        context = decimal.getcontext()
+        found["decimal.getcontext"] = f"prec={context.prec}, rounding={context.rounding}"
+    return found

@@ -83,14 +83,14 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
             content, source = (folder / SETTINGS).read_bytes(), (folder / MODULE).read_bytes()
             settings = read_settings(folder / SETTINGS, content=content)
             stored = read_stored_arrays(folder, settings.hyperparameters)
-        except (BundleError, OSError):
+            module = execute(folder / MODULE, source)
+        except Exception:  # whatever the module's own code raises
             if _identity(folder) == before:
                 raise
             continue
-        # A promotion puts another folder in this one's place: then what was read may be of both.
+        # A promotion puts another folder in this one's place: then what was read, also by the module, may be of both.
         if _identity(folder) == before:
             break
-    module = execute(folder / MODULE, source)
     try:
         enums = getattr(module, "enums", {})
         settings = read_settings(folder / SETTINGS, enums, content)

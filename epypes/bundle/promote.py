@@ -87,7 +87,8 @@ def promote(
             draft = Path(scratch) / target.name
             _write(draft, target, subject, outputs, samples, on_progress)
             on_progress("replaying in a fresh process")
-            prove(draft, target)
+            for note in prove(draft, target).notes:
+                on_progress(note)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):

@@ -14,7 +14,14 @@ from typing import Final
 
 from epypes.bundle.adapters import ANSWER, ANSWERS
 from epypes.bundle.compare import Difference, Tolerance
-from epypes.bundle.conditions import CALL, PROCESS, Condition, other_conditions, usual_environment
+from epypes.bundle.conditions import (
+    CALL,
+    PROCESS,
+    Condition,
+    library_settings,
+    other_conditions,
+    usual_environment,
+)
 from epypes.bundle.determinism import add_tolerances, read_tolerances, widened
 from epypes.bundle.file_access import named_here
 from epypes.bundle.load import SETTINGS
@@ -35,7 +42,7 @@ _WHY: Final = (
 _PROCESSES: Final = 2
 
 
-def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> None:
+def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> ReplayReport:
     """Replay a draft in fresh isolated processes, write its requirements, and seal it.
 
     Two processes replay at the same time, each every sample twice and the second time in the opposite order. The
@@ -62,10 +69,24 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Non
         usual, other = pool.map(replayed, [(), conditions])
         if _tolerate_noise(draft, usual, other):
             other = replayed(conditions)
-        if usual.outside or not (usual.identical and other.identical):
-            raise PromotionRefused(target, _reasons(draft, usual, other, partial(pool.map, replayed)))
+        changed = _changed_settings(usual)
+        if changed or usual.outside or not (usual.identical and other.identical):
+            raise PromotionRefused(target, [*changed, *_reasons(draft, usual, other, partial(pool.map, replayed))])
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
     write_manifest(draft, usual.environment)
+    return usual
+
+
+def _changed_settings(usual: ReplayReport) -> list[str]:
+    """Return how this process has set libraries that are set otherwise in a fresh one, as reasons."""
+    here = library_settings()
+    return [
+        f"The notebook has changed {name} ({value}); a service has it as it is by default ({default}). "
+        "Change it inside the function that needs it, or set it back."
+        for name, default in usual.library_settings.items()
+        for value in [here.get(name, default)]
+        if value != default
+    ]
 
 
 def _tolerate_noise(draft: Path, usual: ReplayReport, other: ReplayReport) -> bool:

@@ -19,7 +19,8 @@ from typing import Any
 
 from epypes.bundle.adapters import ANSWERS, answer_differences, record_answer
 from epypes.bundle.compare import Difference, difference, differences
-from epypes.bundle.conditions import without_python
+from epypes.bundle.conditions import library_settings, without_python
+from epypes.bundle.coverage import LineCoverage
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.manifest import environment
@@ -54,6 +55,8 @@ class ReplayReport:
         What else is worth knowing, as sentences.
     outside
         The files outside of the bundle that its functions open or name, as sentences.
+    library_settings
+        How libraries were set that the replay imported.
     """
 
     samples: int
@@ -65,6 +68,7 @@ class ReplayReport:
     causes: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     outside: tuple[str, ...] = ()
+    library_settings: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:
@@ -239,13 +243,16 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
         except EpypesError:
             break
     before = frozenset(sys.modules)
-    with FileAccess(folder) as access:
+    with FileAccess(folder) as access, LineCoverage(folder / MODULE) as coverage:
         bundle = read_bundle(folder, sealed=is_sealed)
         access.also_in(bundle.settings.hyperparameters)
         report = replay(bundle, twice=twice)
     named = import_all_of((folder / MODULE).read_text(encoding="utf-8"))
     requirements = requirement_lines(named | (sys.modules.keys() - before))
-    return replace(report, outside=access.files, requirements=requirements)
+    notes = (coverage.note,) if coverage.note else ()
+    return replace(
+        report, outside=access.files, requirements=requirements, notes=notes, library_settings=library_settings()
+    )
 
 
 def _describe(error: BaseException, folder: Path) -> str:

@@ -98,6 +98,8 @@ def _written(node: ast.AST, names: Mapping[str, Any]) -> Iterator[ast.expr]:
     if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
         yield node
     if isinstance(node, ast.Call):
+        if isinstance(node.func, ast.Name) and node.func.id in ("setattr", "delattr"):
+            yield from node.args[:1]
         of = node.func.value if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING else None
         given = [*([of] if of is not None else []), *(part.value for part in node.keywords if part.arg in _INTO)]
         yield from (part for part in given if _is_container(evaluated(part, names), names.get(root_of(part))))
@@ -155,18 +157,31 @@ def _asks_for_names(node: ast.AST) -> bool:
 
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
-_Key = tuple[types.ModuleType, str]
+_Key = tuple[types.ModuleType | type, str]
 
 
 def check_patches(found: Any, what: str) -> None:
     """Refuse a definition that reads what the notebook has changed in a module."""
     known, names = _patched(), {**found.names, **_imports_of(found.node)}
+    for node in ast.walk(found.node):
+        if isinstance(node, ast.Name) and (builtins, node.id) in known:
+            _refuse(what, node.id, known[builtins, node.id])
+        for (owner, name), place in known.items():
+            if isinstance(owner, type) and _is_of(node, owner, name, names):
+                _refuse(what, f"{owner.__name__}.{name}", place)
     for chain in _read_by(found.node):
         key = _key(chain, names)
         value = getattr(*key, None) if key is not None and key[0].__name__ != "__main__" else None
         is_own = isinstance(value, types.FunctionType | type) and value.__module__ == "__main__"
         if key is not None and (is_own or key in known):
             _refuse(what, ".".join(chain), known.get(key, found.place))
+
+
+def _is_of(node: ast.AST, owner: type, name: str, names: Mapping[str, Any]) -> bool:
+    """Whether a part of a definition reads an attribute of a name, or the class itself."""
+    if isinstance(node, ast.Attribute) and node.attr == name:
+        return True
+    return isinstance(node, ast.Name | ast.Attribute) and evaluated(node, names) is owner
 
 
 def check_home(home: Importable, what: str) -> None:
@@ -198,9 +213,11 @@ def _patched() -> dict[_Key, str]:
 
 
 def _key(chain: tuple[str, ...], names: Mapping[str, Any]) -> _Key | None:
-    """Return the module of a dotted name, and what is read of it; None for what is of no module."""
+    """Return the module, or class of a library, of a dotted name, and what is read of it; None for anything else."""
     reached = names.get(chain[0])
     for part in chain[1:]:
+        if isinstance(reached, type) and reached.__module__ != "__main__":
+            return reached, part
         if not isinstance(reached, types.ModuleType):
             return None
         inner = getattr(reached, part, None)

@@ -82,7 +82,7 @@ def verify(
         *environment_differences(recorded_environment(folder), report.environment),
     )
     if report.identical:
-        return replace(report, notes=(*report.outside, *notes))
+        return replace(report, notes=(*report.notes, *report.outside, *notes))
     tokens = ", ".join(map(repr, report.unsteady))
     causes = (*([_UNSTEADY.format(tokens)] if tokens else []), *notes)
     raise ReplayDiffers(path, replace(report, causes=causes or (_UNKNOWN,)))

@@ -230,6 +230,19 @@ REFUSED: dict[str, tuple[str, str, str]] = {
         "import textwrap\nkeep = textwrap.dedent\ntextwrap.dedent = functools.partial(keep)\ndef f(a):\n    return textwrap.dedent('a')\ntextwrap.dedent = keep", "f",
         r"'textwrap\.dedent', which the notebook has changed \(cell \[1\], line 6\)",
     ),
+    "method that was changed of a library's class": (
+        "from fractions import Fraction\nFraction.doubled = lambda self: 2 * self\n"
+        "def f(a):\n    return float(Fraction(1, 7).doubled())\ndel Fraction.doubled", "f",
+        r"'Fraction\.doubled', which the notebook has changed \(cell \[1\], line \d\)",
+    ),
+    "builtin that the notebook has added": (
+        "import builtins\nbuiltins.doubled_here = lambda a: 2 * a\ndef f(a):\n    return doubled_here(a)\ndel builtins.doubled_here", "f",
+        r"'doubled_here', which the notebook has changed \(cell \[1\], line \d\)",
+    ),
+    "attribute of a module that is set by name": (
+        "def f(a):\n    setattr(np, '_counted_here', getattr(np, '_counted_here', 0) + 1)\n    return a * np._counted_here", "f",
+        r"writes into 'np', .*\(cell \[1\], line 2\)",
+    ),
     "changed module that a function imports": (
         "import string\nsetattr(string, 'digits', '0123456789')\ndef f(a):\n    from string import digits\n    return digits", "f",
         r"string\.digits', which the notebook has changed \(cell \[1\], line 2\)",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -132,3 +133,24 @@ def test_a_large_array_in_a_hyperparameter_is_refused_and_its_way_out_works(tmp_
     )
     runner.run(image=IMAGE)
     assert (ep.promote(runner, tmp_path / "bundle").path / "arrays").is_dir()
+
+
+def test_a_bundle_that_is_replaced_while_it_is_loaded_is_loaded_whole(tmp_path, monkeypatch):
+    source = "import colorsys\nimport numpy as np\ndef use(x):\n    return K * 1000 + int(T[0, 0]) + 0 * int(colorsys.rgb_to_yiq(1, 1, 1)[0])"
+    for number in (1, 2):
+        names = cell(source, {"__name__": "__main__", "K": number, "T": np.full((60, 70), number)})
+        runner = ep.CompGraphRunner(ep.CompGraph({"use": names["use"]}, {"use": ("x", "out")}))
+        runner.run(x=0)
+        ep.promote(runner, tmp_path / str(number))
+
+    class Replacing:
+        """Replaces the bundle when its module imports, once."""
+
+        def find_spec(self, name, path=None, target=None):
+            if name == "colorsys" and (tmp_path / "2").exists():
+                (tmp_path / "1").rename(tmp_path / "0")
+                (tmp_path / "2").rename(tmp_path / "1")
+
+    monkeypatch.delitem(sys.modules, "colorsys")
+    monkeypatch.setattr(sys, "meta_path", [Replacing(), *sys.meta_path])
+    assert ep.load(tmp_path / "1").run(x=0)["out"] == 2002

@@ -87,6 +87,47 @@ def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):
     assert "It depends on the time zone (TZ), something that is not a token. Use UTC" in text
 
 
+@pytest.mark.parametrize(
+    ("change", "undo", "name"),
+    [
+        (
+            "np.seterr(all='raise')",
+            "np.seterr(divide='warn', over='warn', under='ignore', invalid='warn')",
+            "numpy.seterr",
+        ),
+        ("decimal.getcontext().prec = 5", "decimal.getcontext().prec = 28", "decimal.getcontext"),
+        ("cv2.setUseOptimized(False)", "cv2.setUseOptimized(True)", "cv2.setUseOptimized"),
+    ],
+)
+def test_a_library_that_the_notebook_has_set_otherwise_is_named(change, undo, name, tmp_path):
+    names = cell(
+        f"import cv2, decimal\nimport numpy as np\n{change}\ndef use(x):\n    import cv2, decimal\n    return x + 1"
+    )
+    try:
+        runner = ep.CompGraphRunner(ep.CompGraph({"use": names["use"]}, {"use": ("x", "used")}))
+        runner.run(x=X)
+        with pytest.raises(
+            PromotionRefused, match=rf"The notebook has changed {name} .*a service has it as it is by default"
+        ):
+            ep.promote(runner, tmp_path / "bundle")
+    finally:
+        exec(undo, names)
+
+
+def test_lines_that_no_sample_runs_are_named(tmp_path):
+    source = "def use(x):\n    if x.max() > 2:\n        x = x / 2\n        x = x + 1\n    return x"
+    runner = ep.CompGraphRunner(ep.CompGraph({"use": cell(source)["use"]}, {"use": ("x", "used")}))
+    runner.run(x=X)
+    steps = []
+    bundle = ep.promote(runner, tmp_path / "bundle", on_progress=steps.append)
+    lines = (bundle.path / "pipeline.py").read_text().splitlines()
+    first = lines.index("        x = x / 2") + 1
+    assert f"No sample runs these lines of pipeline.py, so no replay proves them: {first}-{first + 1}. " in steps[-1]
+    assert verify(bundle.path).notes == (steps[-1],)
+    ep.promote(runner, tmp_path / "bundle", samples=[X * 9], on_progress=steps.append)
+    assert verify(bundle.path).notes == ()
+
+
 def test_a_function_that_counts_is_refused(tmp_path):
     text = refusal("import itertools\nN = itertools.count()\ndef use(x):\n    return next(N)", tmp_path / "bundle")
     assert "'use'" in text

@@ -45,7 +45,11 @@ VALUES = st.recursive(
 def bits(value):
     """Return what tells any two values apart, also 0.0 from -0.0; a number that is NaN may have any bits of a NaN."""
     if isinstance(value, np.ndarray | np.generic):
-        return type(value), str(value.dtype), value.shape, value.tobytes()
+        numbers = np.array(value, ndmin=1)
+        if numbers.dtype.kind in "fc":
+            parts = numbers.view(numbers.real.dtype)
+            parts[np.isnan(parts)] = math.nan
+        return type(value), str(value.dtype), value.shape, numbers.tobytes()
     if type(value) in (float, complex):
         whole = complex(value)
         parts = (math.nan if part != part else part for part in (whole.real, whole.imag))
