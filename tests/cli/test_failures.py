@@ -61,7 +61,7 @@ def test_a_message_can_not_dress_up_as_markup_or_as_more_lines(epypes, bundle, k
 
 def test_where_nothing_failed_is_said(epypes, bundle, tmp_path):
     assert "No failures of" in epypes("failures", bundle).stdout
-    assert epypes("failures").stdout.strip() == "No failures were kept."
+    assert epypes("failures").stdout.strip() == "No failures are stored."
     done = epypes("failures", tmp_path / "nothing")
     assert done.returncode == 1
     assert "does not exist" in done.stderr
