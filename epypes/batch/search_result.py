@@ -153,10 +153,14 @@ class OptimizeResult:
 
     def importance_plot(self) -> Figure:
         """Draw how much each hyperparameter matters, as Optuna does with Matplotlib."""
+        from optuna.importance import PedAnovaImportanceEvaluator
         from optuna.visualization.matplotlib import plot_param_importances
 
         _ = self.best_trial
-        return _figure(lambda: plot_param_importances(self.study, target_name=self.metric))
+        with quiet_optuna():
+            # The default one of older versions needs scikit-learn.
+            evaluator = PedAnovaImportanceEvaluator()
+            return _figure(lambda: plot_param_importances(self.study, evaluator, target_name=self.metric))
 
     def __repr__(self) -> str:
         best = best_of(self.trials, self.direction)
