@@ -20,7 +20,7 @@ def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sampl
     (folder / "pipeline.py").write_text(textwrap.dedent(source))
     settings = [
         "[bundle]",
-        f"format = {2 if own else 1}",
+        "format = 1",
         f'name = "{folder.name}"',
         "[ports]",
         f"inputs = {list(inputs)!r}".replace("'", '"'),
