@@ -47,12 +47,12 @@ from epypes.bundle.notebook_source import (
     spelled_tree,
 )
 from epypes.bundle.resolve import layers
-from epypes.bundle.syntax import is_data, is_same_data
+from epypes.bundle.syntax import has_steady_order, is_data, is_same_data
 from epypes.graph import CompGraph, Switch
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array, is_unguarded
 
-_PLAIN: Final = frozenset({int, float, complex, bool, str, bytes, type(None), type(...), set, frozenset})
+_PLAIN: Final = frozenset({int, float, complex, bool, str, bytes, type(None), type(...)})
 _DRAFT: Final = "epypes-draft-"
 _LOST: Final = object()
 # What an attribute in a slot, or the dict of all others, takes of an object.
@@ -170,9 +170,9 @@ class _Walk:
         self.waiting: deque[tuple[_Path, Any, Any]] = deque()
         # The objects by their ids. They are kept here, so that no id is used again.
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
-        self._partners: dict[int, Any] = {}
-        self._divided: _Different | None = None
-        self._asks_for_identity = False
+        self._partners: tuple[dict[int, Any], dict[int, Any]] = {}, {}
+        self._divided: dict[bool, _Different] = {}
+        self._asks_for_identity = self._asks_for_membership = False
 
     def finish(self) -> None:
         """Compare all that is waiting and what it reaches; raise at the first difference."""
@@ -181,14 +181,25 @@ class _Walk:
             ours, theirs = _bare(ours), _bare(theirs)
             if id(ours) in self._called:
                 path = dataclasses.replace(path, closure=id(ours))
-            if type(ours) not in _PLAIN and self._partners.setdefault(id(ours), theirs) is not theirs:
-                text = f"{path.name} is one object in the notebook and several in the module, and a function uses 'is'."
-                self._divided = self._divided or _Different(path, text)
+            self._compare_identity(path, ours, theirs)
             if ours is not theirs and (id(ours), id(theirs)) not in self._seen:
                 self._seen[id(ours), id(theirs)] = ours, theirs
                 self._compare(path, ours, theirs)
-        if self._divided is not None and self._asks_for_identity:
-            raise self._divided
+        for has_equals, difference in self._divided.items():
+            if self._asks_for_identity or (self._asks_for_membership and not has_equals):
+                raise difference
+
+    def _compare_identity(self, path: _Path, ours: Any, theirs: Any) -> None:
+        """Note an object of one side that is several objects of the other."""
+        is_number = type(ours) in _PLAIN
+        if is_number and ours == ours:
+            return
+        has_equals = is_data(ours) and not is_number
+        for side, (one, other) in enumerate(((ours, theirs), (theirs, ours))):
+            if self._partners[side].setdefault(id(one), other) is not other:
+                where, elsewhere = _side(side == 0), _side(side == 1)
+                text = f"{path.name} is one object in the {where} and several in the {elsewhere}, and a function"
+                self._divided.setdefault(has_equals, _Different(path, f"{text} compares by 'is' or 'in'."))
 
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
@@ -205,7 +216,9 @@ class _Walk:
             if not _is_of_notebook(kind) or kind.__name__ != type(theirs).__name__:
                 raise _unlike(path, ours, theirs)
             self._add(path.to(" class"), kind, type(theirs))
-        if is_data(ours) and is_same_data(ours, theirs):
+        if kind in _PLAIN:
+            if not is_same_data(ours, theirs):
+                raise _unlike(path, ours, theirs)
             return
         if is_plain_array(ours) and not ours.dtype.hasobject:
             # A view with gaps is whole in the file that the module reads it from.
@@ -213,8 +226,6 @@ class _Walk:
             if _bits(ours, is_whole) != _bits(theirs, is_whole):
                 raise _unlike(path, ours, theirs)
             return
-        if kind in _PLAIN and kind not in (set, frozenset):
-            raise _unlike(path, ours, theirs)
         try:
             mine, others = _parts(ours), _parts(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
@@ -242,7 +253,9 @@ class _Walk:
             path = _Path(path.root, owner, closure=path.closure)
             if not _is_same_text(ours.__code__, theirs.__code__, node):
                 raise _Different(path, "the notebook has it with another text than the cells have now.")
-            self._asks_for_identity |= node is not None and any(map(_asks_for_identity, ast.walk(node)))
+            parts = [*ast.walk(node)] if node is not None else []
+            self._asks_for_identity |= any(map(_asks_for_identity, parts))
+            self._asks_for_membership |= any(isinstance(part, ast.In | ast.NotIn) for part in parts)
             for name in annotated_names(node) if node is not None else ():
                 if _LOST not in (pair := (_meaning(ours, name), _meaning(theirs, name))):
                     self._add(path.to(f" {name!r}"), *pair)
@@ -423,7 +436,7 @@ def _parts(value: Any) -> dict[str, Any]:
     if isinstance(value, weakref.WeakKeyDictionary | weakref.WeakValueDictionary):
         return {}  # a cache, as of functools.singledispatch
     if type(value) in (set, frozenset):
-        return {" elements": sorted(value, key=repr)}
+        return {" elements": [*value] if has_steady_order(value) else sorted(value, key=repr)}
     if type(value) in (tuple, list):
         return {f"[{number}]": part for number, part in enumerate(value)}
     if type(value) in (dict, types.MappingProxyType):

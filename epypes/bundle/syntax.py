@@ -68,8 +68,16 @@ def quoted(text: str | bytes) -> str:
     return source if '"' in source else source.replace("'", '"')
 
 
+def has_steady_order(values: Iterable[Any]) -> bool:
+    """Whether a set of these has the same order in every process: hashes of text, for one, are seeded."""
+    return all(
+        has_steady_order(value) if type(value) is tuple else type(value) in (bool, int, float, complex)
+        for value in values
+    )
+
+
 def literal(value: Any) -> str:
-    """Return the source of a constant: as repr, but with sets sorted, whose order changes from process to process.
+    """Return the source of a constant: as repr, but with sets sorted whose order changes from process to process.
 
     Raises
     ------
@@ -79,7 +87,8 @@ def literal(value: Any) -> str:
     if type(value) in (str, bytes):
         return quoted(value)
     if type(value) is set and value:
-        return "{" + ", ".join(sorted(map(literal, value))) + "}"
+        elements = map(literal, value)
+        return "{" + ", ".join(elements if has_steady_order(value) else sorted(elements)) + "}"
     if type(value) is dict:
         return "{" + ", ".join(f"{literal(key)}: {literal(item)}" for key, item in value.items()) + "}"
     if type(value) is list:

@@ -91,6 +91,10 @@ PROMOTED: dict[str, tuple[str, ...]] = {
         "import enum\nclass Way(enum.Enum):\n    UP = 1\n    DOWN = -1\ndef f(a, way: Way = Way.DOWN):\n    return a * way.value",
     ),
     "pattern with its flags inside": ("import re\nR = re.compile('(?i)A+')\ndef f(a):\n    return a * len(R.findall('aA b'))",),
+    "order of a set of numbers": ("P = {16, 8, 0}\ndef f(a):\n    return a * [*P][0] + [*P][1]",),
+    "array in a list of arrays": (
+        "K = np.ones(3)\nKS = [np.zeros(3), K]\ndef f(a):\n    return a * sum(known is KS[1] for known in KS)",
+    ),
     "annotation that nothing defines": (f"{LATE}def f(a: Picture, k: Missing = 3) -> Picture:\n    return a * k",),
     "annotation inside that nothing defines": (
         f"{LATE}def f(a):\n    def g(b: Missing) -> list[Missing]:\n        return b * 2\n    c: Missing = g(a)\n    return c",
@@ -109,6 +113,19 @@ REFUSED: dict[str, tuple[str, str]] = {
         "import dataclasses\n@dataclasses.dataclass(frozen=True)\nclass Box:\n    low: int = 2\nBEST = Box()\n"
         "def f(a, box=BEST):\n    return a * (box is OTHER)\nOTHER, BEST = BEST, None",
         "is one object in the notebook and several in the module",
+    ),
+    "array that is also in a list": (
+        "K = np.ones(3)\nKS = [K, np.zeros(3)]\ndef f(a):\n    return a * (K in KS)",
+        "is one object in the notebook and several in the module, and a function compares by 'is' or 'in'",
+    ),
+    "NaN that is also in a list": (
+        "N = float('nan')\nNS = [N]\ndef f(a):\n    return a * (N in NS)", "is one object in the notebook and several in the module",
+    ),
+    "two tuples in the notebook, one in the module": (
+        "A = (1, 2)\nB = tuple([1, 2])\ndef f(a):\n    return a * (A is B)", "is one object in the module and several in the notebook",
+    ),
+    "set with an order that no text of it gives": (
+        "P = set(range(100))\nP -= set(range(100)) - {1, 8}\ndef f(a):\n    return a * [*P][0]", "Make P a token",
     ),
     "list that holds itself": (
         "X = [1]\nX.append(X)\ndef f(a):\n    return a * X[0]", r"uses 'X' from it, of type list\. Make X a token",
