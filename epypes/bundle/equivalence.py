@@ -371,6 +371,10 @@ def _marks(function: Any) -> dict[str, Any]:
     """Return the attributes of a function but for the marks of EPypes and what functools.wraps copies."""
     found = {name: value for name, value in vars(function).items() if not name.startswith("__epypes_")}
     names = sorted(found.keys() - set(functools.WRAPPER_ASSIGNMENTS))
+    if isinstance(function, types.FunctionType) and "__wrapped__" not in found:
+        # The module may have it under another name; a name that was set later is of another kind.
+        found["__name__"] = function.__name__ == function.__code__.co_name or function.__name__
+        names.append("__name__")
     return {f" attribute {name!r}": found[name] for name in names}
 
 

@@ -163,11 +163,14 @@ _Key = tuple[types.ModuleType | type, str]
 def check_patches(found: Any, what: str) -> None:
     """Refuse a definition that reads what the notebook has changed in a module."""
     known, names = _patched(), {**found.names, **_imports_of(found.node)}
+    # A module by itself, as in getattr(module, name), may be asked for any name.
+    dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     for node in ast.walk(found.node):
         if isinstance(node, ast.Name) and (builtins, node.id) in known:
             _refuse(what, node.id, known[builtins, node.id])
         for (owner, name), place in known.items():
-            if isinstance(owner, type) and _is_of(node, owner, name, names):
+            is_asked = isinstance(owner, type) or id(node) not in dotted
+            if is_asked and _is_of(node, owner, name, names):
                 _refuse(what, f"{owner.__name__}.{name}", place)
     for chain in _read_by(found.node):
         key = _key(chain, names)
@@ -177,9 +180,9 @@ def check_patches(found: Any, what: str) -> None:
             _refuse(what, ".".join(chain), known.get(key, found.place))
 
 
-def _is_of(node: ast.AST, owner: type, name: str, names: Mapping[str, Any]) -> bool:
-    """Whether a part of a definition reads an attribute of a name, or the class itself."""
-    if isinstance(node, ast.Attribute) and node.attr == name:
+def _is_of(node: ast.AST, owner: types.ModuleType | type, name: str, names: Mapping[str, Any]) -> bool:
+    """Whether a part of a definition reads an attribute of this name of any object, or the module or class itself."""
+    if isinstance(owner, type) and isinstance(node, ast.Attribute) and node.attr == name:
         return True
     return isinstance(node, ast.Name | ast.Attribute) and evaluated(node, names) is owner
 

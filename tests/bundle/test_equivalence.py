@@ -127,6 +127,12 @@ REFUSED: dict[str, tuple[str, str]] = {
     "set with an order that no text of it gives": (
         "P = set(range(100))\nP -= set(range(100)) - {1, 8}\ndef f(a):\n    return a * [*P][0]", "Make P a token",
     ),
+    "function with another name by now": (
+        "def g(a):\n    return a\ng.__name__ = 'other'\ndef f(a):\n    return g(a) + len(g.__name__)", "its attribute '__name__' is 'other' in the notebook",
+    ),
+    "name that was added to a module and is read by getattr": (
+        "import math\nmath.gain = 3\ndef f(a):\n    return a * getattr(math, 'gain', 1)", "uses 'math.gain', which the notebook has changed",
+    ),
     "list that holds itself": (
         "X = [1]\nX.append(X)\ndef f(a):\n    return a * X[0]", r"uses 'X' from it, of type list\. Make X a token",
     ),
