@@ -374,7 +374,8 @@ def _marks(function: Any) -> dict[str, Any]:
     if isinstance(function, types.FunctionType) and "__wrapped__" not in found:
         # The module may have it under another name; a name that was set later is of another kind.
         found["__name__"] = function.__name__ == function.__code__.co_name or function.__name__
-        names.append("__name__")
+        found["__doc__"] = function.__doc__
+        names += "__name__", "__doc__"
     return {f" attribute {name!r}": found[name] for name in names}
 
 

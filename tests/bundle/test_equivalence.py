@@ -127,6 +127,10 @@ REFUSED: dict[str, tuple[str, str]] = {
     "set with an order that no text of it gives": (
         "P = set(range(100))\nP -= set(range(100)) - {1, 8}\ndef f(a):\n    return a * [*P][0]", "Make P a token",
     ),
+    "function with another docstring by now": (
+        "def g(a):\n    'One.'\n    return a\ng.__doc__ = 'Other.'\ndef f(a):\n    return g(a) + len(g.__doc__)",
+        "its attribute '__doc__' is 'Other.' in the notebook and 'One.' in the module",
+    ),
     "function with another name by now": (
         "def g(a):\n    return a\ng.__name__ = 'other'\ndef f(a):\n    return g(a) + len(g.__name__)", "its attribute '__name__' is 'other' in the notebook",
     ),
