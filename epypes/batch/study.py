@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.batch.ranges import Axis, bounded
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
-from epypes.store.place import connect_options
 
 if TYPE_CHECKING:
     import optuna
@@ -173,6 +172,8 @@ class Search:
         """Open the study in the database and return the trials that have ended, if it searches the same."""
         import optuna
         import sqlalchemy.exc
+
+        from epypes.store.database import connect_options
 
         refusals = (RuntimeError, sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError)
         given = url.render_as_string(hide_password=False)

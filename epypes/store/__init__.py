@@ -1,8 +1,7 @@
 """Results and history in a database: a SQLite file, or any other that SQLAlchemy supports.
 
 - ``store``: a database of series, and series of rows
-- ``database``: transactions, statements, and errors in plain words; the only module that imports SQLAlchemy at its top
-- ``place``: the URL of a database
+- ``database``: URL, transactions, statements, and errors in plain words; it alone imports SQLAlchemy at its top
 - ``writer``: writing on a background thread, so that no caller waits for a disk or a database
 """
 

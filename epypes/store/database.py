@@ -1,4 +1,4 @@
-"""Tables, statements and transactions of a store's database, and its errors in plain words."""
+"""The database of a store: its URL, tables, statements and transactions, and its errors in plain words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import random
 import re
 import sqlite3
-import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping
@@ -21,7 +20,6 @@ from sqlalchemy.dialects.mysql import LONGTEXT
 from sqlalchemy.exc import ArgumentError, DisconnectionError, IntegrityError, NoSuchModuleError, SQLAlchemyError
 
 from epypes.errors import StoreError
-from epypes.store.place import connect_options, shown, url_of
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -31,8 +29,12 @@ SCHEMA: Final = 1
 # Rows read at a time, so that a long series is never in memory as a whole.
 _PAGE: Final = 500
 # If two connections make the tables, or write one key, at the same moment, one of them begins again.
-_TRIES: Final = 8
+_ATTEMPTS: Final = 8
 _PAUSE_S: Final = 0.02
+# Longest waits for a lock of another process, and for a server that does not answer.
+_BUSY_S: Final = 30
+_CONNECT_S: Final = 10
+_DRIVERS: Final = {"postgres": "postgresql+psycopg", "postgresql": "postgresql+psycopg"}
 
 # SQLite counts rows by INTEGER alone; the TEXT of MySQL ends at 64 KB.
 _NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
@@ -80,9 +82,6 @@ _ROWS_AFTER: Final = (
     .order_by(_ROWS.c.id)
     .limit(_PAGE)
 )
-_EXISTING: Final = sa.select(_ROWS.c.digest).where(
-    _ROWS.c.series_id == sa.bindparam("id"), _ROWS.c.digest.in_(sa.bindparam("digests", expanding=True))
-)
 _UPDATE: Final = sa.update(_ROWS).where(
     _ROWS.c.series_id == sa.bindparam("of_series"), _ROWS.c.digest == sa.bindparam("of_key")
 )
@@ -90,6 +89,9 @@ _INSERT: Final = sa.insert(_ROWS)
 
 # Kind and name, both escaped.
 SeriesKey = tuple[str, str]
+# In the `info` of a connection: whether its database has the tables; of SQLite, the identities of its files.
+_HAS_TABLES: Final = "epypes_has_tables"
+_IDENTITIES: Final = "epypes_identities"
 
 
 def _digest(*texts: str) -> str:
@@ -112,9 +114,9 @@ class Database:
     """
 
     def __init__(self, given: str | Path) -> None:
-        self.place = shown(url_of(given))
-        self.engine = _engine_of(url_of(given))
-        self._file_with_tables: object = self
+        url = database_url(given)
+        self.place = without_password(url)
+        self.engine = _create_engine(url)
         self._is_closed = False
         # A store that is never closed, as in a notebook, leaves no connection behind.
         weakref.finalize(self, self.engine.dispose)
@@ -163,21 +165,16 @@ class Database:
 
     def put(self, series: SeriesKey, about: str, texts: Mapping[str, str]) -> None:
         """Write rows by key, all or none; a series that is not there is made with this description."""
-        rows = [{"digest": _digest(key), "key": key, "data": text} for key, text in texts.items()]
 
         def work(connection: sa.Connection) -> None:
             found = connection.execute(_FIND_SERIES, {"digest": _digest(*series)}).one_or_none()
-            number, now_ns = _make_series(connection, series, about) if found is None else found.id, time.time_ns()
-            for first in range(0, len(rows), _PAGE):
-                page = rows[first : first + _PAGE]
-                digests = [row["digest"] for row in page]
-                existing = set(connection.execute(_EXISTING, {"id": number, "digests": digests}).scalars())
-                new = [row for row in page if row["digest"] not in existing]
-                old = [row for row in page if row["digest"] in existing]
-                if new:
-                    connection.execute(_INSERT, [{"series_id": number, "written_ns": now_ns, **row} for row in new])
-                if old:
-                    connection.execute(_UPDATE, [_update(number, now_ns, row) for row in old])
+            number = _make_series(connection, series, about) if found is None else found.id
+            now_ns = time.time_ns()
+            for key, text in texts.items():
+                digest, values = _digest(key), {"data": text, "written_ns": now_ns}
+                updated = connection.execute(_UPDATE, {"of_series": number, "of_key": digest, **values})
+                if not updated.rowcount:
+                    connection.execute(_INSERT, {"series_id": number, "digest": digest, "key": key, **values})
 
         self._transaction(work)
 
@@ -188,21 +185,21 @@ class Database:
         """Do something in one transaction; again if another connection made the same row or table meanwhile."""
         if self._is_closed:
             raise StoreError(self.place, f"The store {self.place} was closed. Open it again: ep.Store(...)")
-        tries = 0
+        attempt = 0
         while True:
-            tries += 1
+            attempt += 1
             try:
                 with self.engine.begin() as connection:
-                    file = connection.info.get(_FILE)
-                    if file != self._file_with_tables:
+                    info = connection.info
+                    if _HAS_TABLES not in info:
                         self._make_tables(connection)
                     found = work(connection)
-                self._file_with_tables = file
+                info[_HAS_TABLES] = True
                 return found
             except SQLAlchemyError as error:
-                if tries == _TRIES or not _is_conflict(error):
+                if attempt == _ATTEMPTS or not _is_conflict(error):
                     raise StoreError(self.place, f"{self.place} {_reason(error, self.engine.url.password)}") from None
-            time.sleep(tries * _PAUSE_S * random.random())  # noqa: S311 - so that the two don't meet again
+            time.sleep(attempt * _PAUSE_S * random.random())  # noqa: S311 - so that the two don't meet again
 
     def _make_tables(self, connection: sa.Connection) -> None:
         _METADATA.create_all(connection)
@@ -210,11 +207,9 @@ class Database:
         if version is None:
             connection.execute(sa.insert(_SCHEMAS).values(id=1, version=SCHEMA))
         elif version != SCHEMA:
-            author, way_out = "an older", "Store in another one, or use that EPypes."
-            if version > SCHEMA:
-                author, way_out = "a newer", "Update: pip install --upgrade epypes"
             versions = f"its tables have version {version}, here it is {SCHEMA}"
-            raise StoreError(self.place, f"{self.place} was made by {author} EPypes: {versions}. {way_out}")
+            text = f"{self.place} was made by a newer EPypes: {versions}. Update: pip install --upgrade epypes"
+            raise StoreError(self.place, text)
 
 
 def _make_series(connection: sa.Connection, series: SeriesKey, about: str) -> int:
@@ -224,19 +219,79 @@ def _make_series(connection: sa.Connection, series: SeriesKey, about: str) -> in
     return int(number[0])
 
 
-def _update(series_id: int, now_ns: int, row: Mapping[str, str]) -> dict[str, Any]:
-    return {"of_series": series_id, "of_key": row["digest"], "data": row["data"], "written_ns": now_ns}
+# -- the URL ----------------------------------------------------------------------------------------------------------
+
+
+def database_url(given: str | Path) -> sa.URL:
+    """Return the URL of a database; a text without ``://`` is the path of a SQLite file.
+
+    Raises
+    ------
+    StoreError
+        There can be no such database.
+    TypeError
+        It is neither a path nor a URL.
+    """
+    if not isinstance(given, str | Path):
+        raise TypeError(f"A store is a path or a URL, not {given!r:.80}. Name a file: 'results.sqlite'.")
+    if not isinstance(given, str) or "://" not in given:
+        url = sa.URL.create("sqlite", database=str(Path(given).expanduser()) if str(given).strip() else "")
+    else:
+        try:
+            url = sa.make_url(given)
+        except (ArgumentError, ValueError):
+            scheme = given.partition("://")[0] or "postgresql"
+            text = (
+                f"The URL {scheme}://... can't be read. It is {scheme}://user:password@host:port/database; "
+                "special characters of a password are written as %40 for @, %3A for : and %2F for /."
+            )
+            # The text that could not be read has the password in it.
+            raise StoreError(f"{scheme}://...", text) from None
+    if url.get_backend_name() != "sqlite":
+        return url.set(drivername=_DRIVERS.get(url.drivername, url.drivername))
+    if url.database in (None, "", ":memory:") or url.query.get("mode") == "memory":
+        text = f"{str(given)!r} is no file, and what is in memory only is lost. Name one: 'results.sqlite'."
+        raise StoreError(str(given), text)
+    if not str(url.database).startswith("file:"):
+        _check_file(Path(str(url.database)))
+    return url
+
+
+def _check_file(path: Path) -> None:
+    folder = path.absolute().parent
+    if path.is_dir():
+        raise StoreError(str(path), f"{path} is a folder. Name a file in it: {path / 'results.sqlite'}")
+    if path.exists() and not path.is_file():
+        raise StoreError(str(path), f"{path} is no file but a device or a pipe. Name a file: 'results.sqlite'.")
+    if not folder.is_dir():
+        raise StoreError(str(path), f"There is no folder {folder} to store {path.name!r} in. Make it first.")
+
+
+def without_password(url: sa.URL) -> str:
+    """Return a database's name in messages: a file by its path, others by URL without password and options."""
+    if url.get_backend_name() == "sqlite":
+        return str(url.database)
+    return url.set(password=None, query={}).render_as_string()
+
+
+def connect_options(url: sa.URL) -> dict[str, Any]:
+    """Return the options of the driver that bound every wait."""
+    if url.get_backend_name() == "sqlite":
+        return {"timeout": _BUSY_S}
+    if url.drivername in ("postgresql+psycopg", "postgresql+psycopg2"):
+        return {"connect_timeout": _CONNECT_S, "tcp_user_timeout": 1000 * _BUSY_S}
+    return {}
 
 
 # -- connections ------------------------------------------------------------------------------------------------------
 
 
-def check_place(given: str | Path) -> None:
+def check_database(given: str | Path) -> None:
     """Raise StoreError if there can be no such database; whether it answers is not tried."""
-    _engine_of(url_of(given)).dispose()
+    _create_engine(database_url(given)).dispose()
 
 
-def _engine_of(url: sa.URL) -> sa.Engine:
+def _create_engine(url: sa.URL) -> sa.Engine:
     """Return what connects to a database; no connection is made yet."""
     try:
         # Pinged, so that a server that was restarted is found again.
@@ -246,77 +301,48 @@ def _engine_of(url: sa.URL) -> sa.Engine:
         way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
         missing = getattr(error, "name", None)
         reason = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {url.drivername!r}"
-        text = f"{shown(url)} can't be opened: {reason}. {way_out}, or store in a file: 'results.sqlite'."
-        raise StoreError(shown(url), text) from None
+        name = without_password(url)
+        text = f"{name} can't be opened: {reason}. {way_out}, or store in a file: 'results.sqlite'."
+        raise StoreError(name, text) from None
     if engine.dialect.name == "sqlite":
-        files = _FileTracker(str(url.database))
-        sa.event.listen(engine, "connect", _use_wal)
-        sa.event.listen(engine, "connect", files.on_connect)
-        sa.event.listen(engine, "checkout", files.on_checkout)
+        sa.event.listen(engine, "connect", _open_file)
+        sa.event.listen(engine, "checkout", _check_identity)
     return engine
 
 
-def _use_wal(connection: Any, _record: object) -> None:
-    """Use a write-ahead log, so that readers and writers don't wait for each other.
+def _open_file(connection: Any, record: Any) -> None:
+    """Use a write-ahead log, so that readers and writers don't wait for each other; note which files are open.
 
     A power failure may take the last rows, never the file.
     """
     connection.execute("PRAGMA synchronous=NORMAL")
-    for tries in range(1, _TRIES + 1):
-        try:
-            connection.execute("PRAGMA journal_mode=WAL")
-            return
-        except sqlite3.OperationalError as error:
-            # SQLite does not wait here for another connection that changes it just now.
-            if tries == _TRIES or "locked" not in str(error):
-                raise
-            time.sleep(tries * _PAUSE_S)
+    # SQLite refuses at once while another connection changes it, and the file keeps what that one sets.
+    with suppress(sqlite3.OperationalError):
+        connection.execute("PRAGMA journal_mode=WAL")
+    # SQLite opens the files beside it with the first query.
+    connection.execute("SELECT 1 FROM sqlite_master").fetchall()
+    path = connection.execute("PRAGMA database_list").fetchone()[2]
+    record.info[_IDENTITIES] = {name: _identity(name) for name in (path, f"{path}-wal", f"{path}-shm")}
 
 
-# In the `info` of a connection: the number of its file, and its path and identities.
-_FILE, _FOUND = "epypes_file", "epypes_found"
-# SQLite writes beside a file what is not in it yet.
-_BESIDE: Final = ("-wal", "-shm")
-
-
-class _FileTracker:
-    """Has an engine's connections follow the file at a path, since a deleted file stays open and takes rows silently.
-
-    Files are numbered, since the disk may give a new file the identity of the one that was deleted.
-    """
-
-    def __init__(self, name: str) -> None:
-        # A link, which may lead to another file later; a URL of SQLite has no link in it.
-        self._link = "" if name.startswith("file:") else os.path.abspath(name)
-        self._count, self._lock = 0, threading.Lock()
-
-    def on_connect(self, connection: Any, record: Any) -> None:
-        # SQLite opens the files beside it with the first query.
-        connection.execute("SELECT 1 FROM sqlite_master").fetchall()
-        path = connection.execute("PRAGMA database_list").fetchone()[2]
-        record.info[_FILE] = self._count
-        record.info[_FOUND] = path, {ending: _identity(path + ending) for ending in ("", *_BESIDE)}
-
-    def on_checkout(self, connection: Any, record: Any, _fairy: object) -> None:
-        path, found = record.info[_FOUND]
-        if _identity(self._link or path) == found[""]:
-            return
-        with self._lock:
-            if record.info[_FILE] == self._count:
-                self._count += 1
-                _log.warning(
-                    "%s was deleted, moved or replaced while it was open. Later rows are written to the file of that "
-                    "name, which is made anew if there is none; earlier rows are not in it.",
-                    self._link or path,
-                )
-            # The old file is completed. Its log, left beside its old path, would be taken for the new file's.
-            with suppress(sqlite3.Error):  # it may be on no disk any more
-                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            for ending in _BESIDE:
-                if found[ending] is not None and _identity(path + ending) == found[ending]:
-                    with suppress(OSError):
-                        os.unlink(path + ending)
-        raise DisconnectionError(f"{path} is another file now.")
+def _check_identity(connection: Any, record: Any, _fairy: object) -> None:
+    """Have a connection reopen its file if another one is at the path: a deleted file would take rows silently."""
+    (path, identity), *beside = record.info[_IDENTITIES].items()
+    if _identity(path) == identity:
+        return
+    _log.warning(
+        "%s was deleted, moved or replaced while it was open. Later rows are written to the file of that "
+        "name, which is made anew if there is none; earlier rows are not in it.",
+        path,
+    )
+    # The old file is completed. Its log, left beside its old path, would be taken for the new file's.
+    with suppress(sqlite3.Error):  # it may be on no disk any more
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    for name, identity in beside:
+        if identity is not None and _identity(name) == identity:
+            with suppress(OSError):
+                os.unlink(name)
+    raise DisconnectionError(f"{path} is another file now.")
 
 
 def _identity(path: str) -> tuple[int, int] | None:

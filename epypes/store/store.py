@@ -1,7 +1,7 @@
 r"""A database of series, and series of rows that are written once under each key.
 
 A row is JSON text that any reader of JSON understands, so NaN and infinities become ``{"$float": "nan"}``. NUL and
-halves of surrogate pairs, which PostgreSQL or UTF-8 refuse, are _escaped as ``\u0000``.
+halves of surrogate pairs, which PostgreSQL or UTF-8 refuse, are escaped as ``\u0000``.
 """
 
 from __future__ import annotations
@@ -114,11 +114,11 @@ def opened_store(given: str | Path | Store | None) -> Iterator[Store | None]:
     ------
     StoreError
         It can't be opened.
+    TypeError
+        It is neither a path, a URL nor a Store.
     """
     if given is None or isinstance(given, Store):
         yield given
-    elif not isinstance(given, str | Path):
-        raise TypeError(f"store= must be a path, a URL or an ep.Store, not {type(given).__name__!r}.")
     else:
         with Store(given) as store:
             yield store

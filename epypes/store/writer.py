@@ -45,24 +45,16 @@ class BackgroundWriter(Generic[_T]):
         How many items are written at a time.
     """
 
-    def __init__(
-        self,
-        name: str,
-        write: Callable[[list[_T]], bool],
-        *,
-        most: int,
-        at_a_time: int = 1,
-    ) -> None:
+    def __init__(self, name: str, write: Callable[[list[_T]], bool], *, most: int, at_a_time: int = 1) -> None:
         self._name, self._write = name, write
         self._most, self._at_a_time = most, at_a_time
         self._items: deque[_T] = deque()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         self._flushing = 0
-        self._failed_s, self._pause_s = 0.0, 0.0
 
     def __len__(self) -> int:
-        """How many items wait, or are being written."""
+        """Return how many items wait or are being written."""
         return len(self._items)
 
     def put(self, item: _T) -> bool:
@@ -95,32 +87,30 @@ class BackgroundWriter(Generic[_T]):
         self._changed.notify_all()
 
     def _run(self) -> None:
-        while items := self._next():
+        pause_s = 0.0
+        while items := self._next(pause_s):
             try:
                 is_done = self._write(items)
             except Exception:  # the next items must be written, whatever is wrong with these
                 _log.exception("%s could not write", self._name)
                 is_done = True
             with self._changed:
+                pause_s = 0.0 if is_done else min(max(2 * pause_s, _FIRST_PAUSE_S), _LONGEST_PAUSE_S)
                 if is_done:
                     for _ in items:
                         self._items.popleft()
-                    self._pause_s = 0.0
-                else:
-                    self._failed_s = monotonic()
-                    self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), _LONGEST_PAUSE_S)
                 self._changed.notify_all()
             del items  # their memory is given back while the next ones are waited for
 
-    def _next(self) -> list[_T]:
-        """Return the next items, once they are due; none if none wait."""
+    def _next(self, pause_s: float) -> list[_T]:
+        """Return the next items after a pause; none if none wait."""
+        began_s = monotonic()
         with self._changed:
             while self._items:
-                pause_s = min(self._pause_s, _FLUSHING_PAUSE_S) if self._flushing else self._pause_s
-                due_in_s = self._failed_s + pause_s - monotonic()
-                if due_in_s <= 0:
+                due_s = began_s + (min(pause_s, _FLUSHING_PAUSE_S) if self._flushing else pause_s)
+                if due_s <= monotonic():
                     return list(islice(self._items, self._at_a_time))
-                self._changed.wait(due_in_s)
+                self._changed.wait(due_s - monotonic())
             self._thread = None
             return []
 
@@ -165,8 +155,8 @@ class SeriesWriter:
         self._place = None if isinstance(store, Store) else store
         if self._place is not None:
             with optional_import():
-                from epypes.store.database import check_place
-            check_place(self._place)
+                from epypes.store.database import check_database
+            check_database(self._place)
         self._series: Series | None = None
         self._on_problem = report
         self._is_away = False
@@ -203,50 +193,40 @@ class SeriesWriter:
 
     def _write(self, rows: list[tuple[str, Mapping[str, Any]]]) -> bool:
         try:
-            written = self._put(rows)
+            unwritten = self._put(rows)
         except StoreError as error:
             is_first, self._is_away = not self._is_away, True
             if is_first:
                 self._report(f"{error} Rows of {self._kind} {self._name!r} wait for it.")
             return False
         with self._lock:
-            self._counts["written"] += written
-            self._counts["unwritten"] += len(rows) - written
+            self._counts["written"] += len(rows) - unwritten
+            self._counts["unwritten"] += unwritten
         if self._is_away:
             _log.info("Rows of %s %r are written again.", self._kind, self._name)
         self._is_away = False
         return True
 
     def _put(self, rows: list[tuple[str, Mapping[str, Any]]]) -> int:
-        """Write rows; return how many, since a row that is no JSON can never be written."""
-        series = self._opened()
+        """Write rows; return how many can never be written, since they are no JSON."""
+        if self._series is None:
+            self._store = Store(self._place or "") if self._store is None else self._store
+            self._series = self._store.series(self._kind, self._name, about=self._about)
         try:
-            series.append_all(rows)
-        except StoreError:
-            raise
-        except Exception:  # one row is no JSON, or fails in another way; the others are written
-            return sum(self._is_put(series, row) for row in rows)
-        return len(rows)
-
-    def _is_put(self, series: Series, row: tuple[str, Mapping[str, Any]]) -> bool:
-        try:
-            series.append(*row)
-        except StoreError:
-            raise
-        except Exception as error:
-            self._report(str(error) or repr(error))
-            return False
-        return True
+            self._series.append_all(rows)
+            return 0
+        except TypeError:  # of one row; the others are written
+            unwritten = 0
+        for key, data in rows:
+            try:
+                self._series.append(key, data)
+            except TypeError as error:
+                unwritten += 1
+                self._report(str(error))
+        return unwritten
 
     def _report(self, text: str) -> None:
         try:
             self._on_problem(text)
         except Exception:  # the rows must be written, whatever is wrong with the caller's function
             _log.exception("the function that gets reports of %s %r failed", self._kind, self._name)
-
-    def _opened(self) -> Series:
-        if self._series is None:
-            if self._store is None:
-                self._store = Store(self._place or "")
-            self._series = self._store.series(self._kind, self._name, about=self._about)
-        return self._series

@@ -42,14 +42,14 @@ class Server:
         if os.geteuid() == 0:
             shutil.chown(folder, _USER)
             shutil.chown(secret, _USER)
-        told = [
+        options = [
             f"--pgdata={folder}/data",
             "--username=epypes",
             "--auth=scram-sha-256",
             f"--pwfile={secret}",
             "--no-sync",
         ]
-        self._run(_binary("initdb"), *told, "--encoding=UTF8", "--locale=C.UTF-8", "--no-instructions")
+        self._run(_binary("initdb"), *options, "--encoding=UTF8", "--locale=C.UTF-8", "--no-instructions")
 
     def _run(self, *command: str) -> None:
         subprocess.run(
@@ -58,9 +58,9 @@ class Server:
 
     def start(self) -> None:
         options = {"port": self.port, "listen_addresses": "127.0.0.1", "unix_socket_directories": "", "fsync": "off"}
-        told = [word for name, value in options.items() for word in ("-c", f"{name}={value}")]
+        options = [word for name, value in options.items() for word in ("-c", f"{name}={value}")]
         with (self._folder / "log").open("ab") as log:
-            command = [_binary("postgres"), "-D", f"{self._folder}/data", *told]
+            command = [_binary("postgres"), "-D", f"{self._folder}/data", *options]
             self._process = subprocess.Popen(
                 command,
                 cwd=self._folder,

@@ -148,7 +148,7 @@ def test_rows_are_read_page_by_page_in_the_order_of_writing(store):
     assert [row["n"] for row in series.rows()] == [-number for number in range(1_203)]
 
 
-def test_series_are_told_apart_by_kind_and_name(store):
+def test_series_are_distinguished_by_kind_and_name(store):
     for kind, name in (("map", "b"), ("map", "a"), ("sweep", "a")):
         store.series(kind, name).append("key", {"of": [kind, name]})
     assert store.kinds() == ("map", "sweep")
@@ -157,7 +157,7 @@ def test_series_are_told_apart_by_kind_and_name(store):
     assert store.series("sweep", "a").get("key") == {"of": ["sweep", "a"]}
 
 
-def test_what_is_said_of_a_series_is_said_when_it_is_made(store):
+def test_a_series_is_described_when_it_is_made(store):
     assert store.series("map", "edges", about={"k": math.inf}).about == {"k": math.inf}
     assert store.series("map", "edges", about={"k": 2}).about == {"k": math.inf}
     assert store.series("map", "other").about == {}
@@ -176,7 +176,7 @@ def test_to_look_into_a_series_does_not_make_it(store):
     assert len(store.series("map", "edges")) == 2
 
 
-def test_a_series_of_which_nothing_was_said_is_made_by_its_first_row(store):
+def test_a_series_without_a_description_is_made_by_its_first_row(store):
     store.series("tuning", "edges").append("a", {"n": 1})
     assert store.names("tuning") == ("edges",)
     assert store.series("tuning", "edges", about={"k": 1}).about == {}
@@ -212,8 +212,8 @@ with Store(place) as store:
 @pytest.mark.slow
 def test_processes_write_to_a_new_database_at_once_and_nothing_is_lost_or_twice(place):
     # Started before there is a database: they make its tables all at once.
-    told = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
-    children = [subprocess.Popen([sys.executable, "-c", _CHILD, place, str(name)], **told) for name in range(4)]
+    options = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
+    children = [subprocess.Popen([sys.executable, "-c", _CHILD, place, str(name)], **options) for name in range(4)]
     for child in children:
         child.stdin.write(b"\n")
         child.stdin.flush()
@@ -263,7 +263,7 @@ def test_a_path_is_a_file_and_a_store_stays_what_it_is(tmp_path, monkeypatch):
             assert store.kinds() == ()
     names = ("plain.sqlite", "path.sqlite", "home.sqlite", "url.sqlite", "odd #?%41 name")
     assert all((tmp_path / name).is_file() for name in names)
-    with pytest.raises(TypeError, match="must be a path, a URL or an ep.Store, not 'int'"), opened_store(3):
+    with pytest.raises(TypeError, match="A store is a path or a URL, not 3"), opened_store(3):
         pass
 
 
@@ -281,7 +281,7 @@ def test_a_store_that_was_given_stays_open_and_one_that_was_opened_for_it_is_clo
     )
 
 
-def test_a_store_is_closed_twice_and_says_shortly_what_it_is(store):
+def test_a_store_is_closed_twice_and_has_a_short_repr(store):
     assert len(repr(store)) < 100
     assert repr(store.series("map", "edges" * 50)).startswith("<Series map 'edgesedges")
     store.close()

@@ -78,7 +78,7 @@ def test_a_caller_does_not_wait_for_the_database_and_rows_that_do_not_fit_are_co
 
 
 @pytest.mark.slow
-def test_rows_wait_for_a_server_that_is_away_which_is_told_once(caplog):
+def test_rows_wait_for_a_server_that_is_away_which_is_logged_once(caplog):
     caplog.set_level(logging.INFO, "epypes.store")
     with server() as own:
         url = own.url()

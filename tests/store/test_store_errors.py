@@ -98,7 +98,7 @@ def test_a_file_that_is_no_database_is_left_alone(tmp_path):
     assert path.read_bytes() == b"\x89PNG" * 2_000
 
 
-def test_a_file_that_was_damaged_is_told(tmp_path):
+def test_a_file_that_was_damaged_is_reported(tmp_path):
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
         store.series("map", "edges").append_all((f"{number}", {"text": "x" * 500}) for number in range(200))
@@ -109,7 +109,7 @@ def test_a_file_that_was_damaged_is_told(tmp_path):
         list(store.series("map", "edges").rows())
 
 
-def test_a_row_that_was_written_by_another_program_is_told_with_its_key(store):
+def test_a_row_that_was_written_by_another_program_is_reported_with_its_key(store):
     series = store.series("map", "edges")
     series.append("mine", {"x": 1})
     execute(store, "UPDATE epypes_rows SET data = '{half'")
@@ -147,7 +147,7 @@ with Store(sys.argv[1]) as store:
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path):
+def test_a_full_disk_is_reported_and_nothing_is_half_written(tmp_path):
     path = tmp_path / "results.sqlite"
     done = subprocess.run([sys.executable, "-c", _WITHOUT_ROOM, path], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
@@ -172,7 +172,7 @@ except StoreError as error:
 
 
 @pytest.mark.slow
-def test_a_file_that_may_not_be_written_is_told(tmp_path_factory):
+def test_a_file_that_may_not_be_written_is_reported(tmp_path_factory):
     import tempfile
     from pathlib import Path
 
@@ -192,8 +192,8 @@ def test_a_file_that_may_not_be_written_is_told(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_file_that_another_process_holds_is_waited_for_and_then_told(tmp_path, monkeypatch):
-    monkeypatch.setattr("epypes.store.place._BUSY_S", 0.2)
+def test_a_file_that_another_process_holds_is_waited_for_and_then_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr("epypes.store.database._BUSY_S", 0.2)
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
         series = store.series("map", "edges")
@@ -249,7 +249,7 @@ def test_a_refused_login_is_an_error_and_the_password_is_nowhere(postgres):
 
 
 @pytest.mark.slow
-def test_a_server_that_dies_is_told_and_after_a_restart_the_same_store_works_again():
+def test_a_server_that_dies_is_reported_and_after_a_restart_the_same_store_works_again():
     with server() as own, Store(own.url()) as store:
         series = store.series("map", "edges")
         series.append("before", {"x": 1})
@@ -275,7 +275,7 @@ def test_a_password_that_a_server_repeats_is_left_out(postgres):
 
 
 def test_a_long_reader_does_not_hold_a_writer_up(tmp_path, monkeypatch):
-    monkeypatch.setattr("epypes.store.place._BUSY_S", 0.2)
+    monkeypatch.setattr("epypes.store.database._BUSY_S", 0.2)
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
         series = store.series("map", "edges")
@@ -296,7 +296,7 @@ def keys_in(path):
         return store.series("map", "edges").keys()
 
 
-def test_a_file_that_is_deleted_is_made_anew_with_all_that_comes_then_and_told_once(tmp_path, caplog):
+def test_a_file_that_is_deleted_is_made_anew_with_all_that_comes_then_and_logged_once(tmp_path, caplog):
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
         other, series = store.series("map", "other"), store.series("map", "edges", about={"k": 3})
@@ -385,7 +385,7 @@ def test_two_stores_go_on_with_the_same_new_file(tmp_path):
     assert len(keys_in(path)) == 40
 
 
-def test_a_file_whose_folder_is_gone_is_told(tmp_path):
+def test_a_file_whose_folder_is_gone_is_reported(tmp_path):
     folder = tmp_path / "results"
     folder.mkdir()
     with Store(folder / "results.sqlite") as store:
