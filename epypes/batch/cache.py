@@ -52,11 +52,14 @@ class Fingerprint:
     unknown
         The first object whose content can't be digested, as text; "" if there is none. A computation with one may be
         another one although the digests are the same.
+    reader
+        The first name by which a function reads files or the environment; "" if there is none.
     """
 
     code: str
     state: str
     unknown: str
+    reader: str
 
 
 def source_of(cg: CompGraph) -> str | None:
@@ -67,25 +70,15 @@ def source_of(cg: CompGraph) -> str | None:
         return None
 
 
-def graph_fingerprint(cg: CompGraph, source: str | None) -> Fingerprint:
-    """Return the fingerprint of what a graph computes.
-
-    Parameters
-    ----------
-    cg
-        The graph.
-    source
-        What `source_of` returned: the text of a graph has the expressions of objects whose content can't be digested.
-
-    Notes
-    -----
-    The text alone would not do: a module that was edited and not loaded again computes what its file had before.
-    """
+def graph_fingerprint(cg: CompGraph) -> Fingerprint:
+    """Return the fingerprint of what a graph computes."""
     digester = Digester()
     digester.add(cg)
-    versions = versions_of(digester.modules, source or "")
-    code = combined_digest("graph", source or "", digester.code.digest(), *versions).hex()
-    return Fingerprint(code, digester.state.hexdigest(), digester.unknown if source is None else "")
+    # An object whose content can't be digested, as a detector of OpenCV, counts by the expression that makes it.
+    source = (source_of(cg) or "") if digester.unknown else ""
+    code = combined_digest("graph", source, digester.code.digest(), *versions_of(digester.modules)).hex()
+    state = combined_digest("state", digester.state.digest(), *versions_of(digester.state_modules)).hex()
+    return Fingerprint(code, state, "" if source else digester.unknown, digester.reader)
 
 
 def function_digest(function: Any) -> str:
@@ -94,7 +87,7 @@ def function_digest(function: Any) -> str:
     Raises
     ------
     NoDigest
-        It uses an object whose content can't be digested.
+        It uses an object whose content can't be digested, or reads files or the environment.
     """
     return _digest(Digester(), function)
 
@@ -112,9 +105,14 @@ def value_digest(value: Any) -> str:
 
 def _digest(digester: Digester, value: Any) -> str:
     digester.add(value)
-    if digester.unknown:
-        raise NoDigest(digester.unknown)
+    if digester.unknown or digester.reader:
+        raise NoDigest(digester.unknown or reader_text(digester.reader))
     return digester.digest().hex()
+
+
+def reader_text(name: str) -> str:
+    """Return what a function reads from outside, for messages."""
+    return f"a function that reads files or the environment ({name!r})"
 
 
 def payload_digest(payload: Mapping[str, Any]) -> str:
@@ -192,42 +190,48 @@ def outcome_cache(
     Warns
     -----
     UserWarning
-        A function uses an object whose content can't be digested, so nothing that is stored counts.
+        Nothing that is stored counts, since the graph uses an object whose content can't be digested, or, without a
+        name, reads files or the environment.
 
     Raises
     ------
     ScaleError
-        There is no name and the graph can't be written as text; or the series is of another graph or of other
-        hyperparameters.
+        The series is of another graph or of other hyperparameters.
     """
     with opened_store(store) as opened:
         if opened is None:
             yield None
             return
-        series, found = _series_of(opened, kind, runner, name, varied)
+        found = graph_fingerprint(runner.cg)
+        series = _series_of(opened, kind, runner, name, varied, found)
+        doubt = _doubt(found, has_name=bool(name))
+        if doubt:
+            warn(doubt, stacklevel=4)
         shown = "" if show == () else f"show={show and list(show)}"
-        with OutcomeCache(series, f"{shown} state={found.state}", reads=not keep and not found.unknown) as cache:
+        with OutcomeCache(series, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
             yield cache
 
 
+def _doubt(found: Fingerprint, *, has_name: bool) -> str:
+    """Return why stored outcomes may be those of another computation; "" if they can't be."""
+    if found.unknown:
+        text = f"The graph uses {found.unknown}, whose content can't be compared: every item is run again."
+        return f"{text} Use functions, numbers, texts, arrays, or objects that can be pickled."
+    if found.reader and not has_name:
+        text = f"The graph uses {reader_text(found.reader)}, which may have changed: every item is run again."
+        return f"{text} To reuse what is stored, give name=, and another name once such a file or variable has changed."
+    return ""
+
+
 def _series_of(
-    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str]
-) -> tuple[Series, Fingerprint]:
-    source = source_of(runner.cg)
-    found = graph_fingerprint(runner.cg, source)
+    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str], found: Fingerprint
+) -> Series:
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
     about = {"graph": found.code, "hyperparameters": _hyperparameter_labels(fixed)}
-    if name is None:
-        if source is None:
-            text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
-            raise ScaleError(text)
-        name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
-    series = store.series(kind, name, about=about)
+    own_name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
+    series = store.series(kind, name or own_name, about=about)
     _check_same(series, about)
-    if found.unknown:
-        text = f"The graph uses {found.unknown}, and nothing tells whether that has changed: every item is run again."
-        warn(f"{text} Use functions, numbers, texts, arrays, or objects that can be pickled.", stacklevel=5)
-    return series, found
+    return series
 
 
 def _hyperparameter_labels(values: Mapping[str, Any]) -> dict[str, str]:
@@ -236,7 +240,7 @@ def _hyperparameter_labels(values: Mapping[str, Any]) -> dict[str, str]:
         try:
             labels[token] = value_label(value)
         except NoDigest as error:
-            text = f"Hyperparameter {token!r} is or holds {error}: nothing tells it from others, as a store has to."
+            text = f"Hyperparameter {token!r} is or holds {error}, whose content a store can't compare with another."
             raise ScaleError(f"{text} Make it of numbers, texts, arrays, lists or dicts.") from error
     return labels
 

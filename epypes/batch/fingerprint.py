@@ -1,31 +1,31 @@
 """Fingerprints: digests of a value or a function and of everything that it refers to.
 
 A digest covers a function's code, defaults, closure and attributes and the globals that it reads, and of each object
-its class and its state. Installed packages and the standard library count by name; `versions_of` adds their versions,
-and the content of modules that are not installed. A value is described as `pickle` would describe it, by its
-`__reduce_ex__`; in contrast to pickle, functions and classes of the user count by what they do.
+its class and its state. Installed packages and the standard library count by name; `versions_of` adds their versions.
+A value is described as `pickle` would describe it, by its `__reduce_ex__`; in contrast to pickle, functions and classes
+of the user count by what they do, also those of modules that a function imports when it is called.
 
-An object that pickle can't describe, such as a generator or an object of a C library, is unknown. A caller must not
-take equal digests with an unknown for a proof that nothing has changed.
+Two things a digest can't cover: an object that pickle can't describe, such as a generator or an object of a C library,
+is unknown; and what a function reads from files or the environment is not part of it. The digester names the first of
+each, and then equal digests are no proof that nothing has changed.
 """
 
 from __future__ import annotations
 
-import ast
 import copyreg
 import dis
 import enum
 import functools
 import hashlib
+import importlib
+import importlib.util
 import sys
 import threading
 import types
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from functools import lru_cache
+from contextlib import contextmanager, nullcontext, suppress
 from importlib import metadata
-from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path, PurePath
 from typing import Any, Final
 
@@ -45,6 +45,22 @@ _READS_NAME: Final = frozenset({"LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_G
 # Builtins by which code reads what its names don't say.
 _BY_TEXT: Final = frozenset({"eval", "exec", "globals", "__import__"})
 _ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
+# Names by which code reads files or the environment: of Python, numpy, OpenCV, Pillow, pandas and scikit-image.
+_READERS: Final = frozenset(
+    {"environ", "environb", "fromfile", "genfromtxt", "getenv", "getenvb", "imread", "imreadmulti", "load", "loadtxt"}
+    | {
+        "memmap",
+        "open",
+        "open_memmap",
+        "read_bytes",
+        "read_csv",
+        "read_parquet",
+        "read_text",
+        "urlopen",
+        "VideoCapture",
+    }
+)
+_LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
 _LEAVES: Final = (type(None), bool, float, complex, type(...), type(NotImplemented))
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset({"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "uuid"})
@@ -110,17 +126,21 @@ class Digester:
     code, state
         Two digests: of functions, classes and immutable values; and of what is in lists, dicts, arrays and objects,
         which a call may change.
-    modules
-        The names of the modules that were met.
+    modules, state_modules
+        The names of the modules that were met in each of the two.
     unknown
         The first object that pickle can't describe, as text; "" if there is none.
+    reader
+        The first name by which a function reads files or the environment; "" if there is none.
     """
 
     def __init__(self, *, of_data: bool = False, path: list[str] | None = None) -> None:
         self.code = hashlib.blake2b(digest_size=_DIGEST_BYTES)
         self.state = hashlib.blake2b(digest_size=_DIGEST_BYTES)
         self.modules: set[str] = set()
+        self.state_modules: set[str] = set()
         self.unknown = ""
+        self.reader = ""
         self._into = self.code
         # With the objects themselves, so that no other gets the identity of one.
         self._numbers: dict[int, tuple[int, Any]] = {}
@@ -140,6 +160,9 @@ class Digester:
 
     def _put(self, *parts: str | bytes | memoryview) -> None:
         _add_parts(self._into, parts)
+
+    def _meet(self, module: str) -> None:
+        (self.modules if self._into is self.code else self.state_modules).add(module)
 
     def _add_unknown(self, value: Any, what: str = "") -> None:
         kind = type(value).__qualname__
@@ -218,8 +241,9 @@ class Digester:
         for member in list(found):
             own = Digester(of_data=self._of_data, path=self._path)
             own.add(member)
-            self.modules |= own.modules
+            (self.modules if self._into is self.code else self.state_modules).update(own.modules, own.state_modules)
             self.unknown = self.unknown or own.unknown
+            self.reader = self.reader or own.reader
             members.append(own.digest())
         with self._in_state() if type(found) is set else nullcontext():
             self._put("set", *sorted(members))
@@ -242,7 +266,7 @@ class Digester:
 
     def _add_function(self, function: types.FunctionType) -> None:
         code = function.__code__
-        self.modules.add(str(function.__module__))
+        self._meet(str(function.__module__))
         self._put("function", function.__qualname__)
         self._add_code(code)
         self._add(function.__defaults__)
@@ -270,6 +294,12 @@ class Digester:
         read: dict[str, Any] = {}
         seen: set[str] = set()
         waiting = [(name, found[name]) for name in names if name in found]
+        for name in _imported_within(codes, found.get("__package__") or ""):
+            if _is_installed(name):
+                self._meet(name)
+            else:
+                with suppress(Exception):  # the function raises the same when it is called
+                    waiting.append((name, importlib.import_module(name)))
         while waiting:
             name, value = waiting.pop()
             read[name] = value
@@ -278,6 +308,8 @@ class Digester:
                 own = vars(value)
                 of_it = set(own) if _ATTRIBUTES_BY_TEXT & (names | attributes) else attributes.intersection(own)
                 waiting += [(f"{name}.{one}", own[one]) for one in sorted(of_it) if not one.startswith("__")]
+        own_functions = {name.rpartition(".")[2] for name, one in read.items() if isinstance(one, types.FunctionType)}
+        self.reader = self.reader or min(_READERS & (names | attributes) - own_functions, default="")
         return read
 
     def _add_code(self, code: types.CodeType) -> None:
@@ -295,13 +327,13 @@ class Digester:
         self._add(content)
 
     def _add_module(self, module: types.ModuleType) -> None:
-        self.modules.add(module.__name__)
+        self._meet(module.__name__)
         self._put("module", module.__name__)
         if module.__name__ == "__main__":
             self._add_unknown(module)
 
     def _add_class(self, found: type) -> None:
-        self.modules.add(found.__module__)
+        self._meet(found.__module__)
         self._put("class", found.__qualname__)
         self._add(type(found))
         self._add(found.__bases__)
@@ -331,7 +363,7 @@ class Digester:
             if _is_installed(type(value).__module__):
                 return
         module = type(value).__module__
-        with self._in_state():
+        with nullcontext() if isinstance(value, types.BuiltinFunctionType) else self._in_state():
             if self._of_data and _is_installed(module) and module.partition(".")[0] not in _DATA_MODULES:
                 self._add_unpicklable(value)
             else:
@@ -359,7 +391,7 @@ class Digester:
     def _add_global(self, value: Any, name: str) -> None:
         module = getattr(value, "__module__", None)
         module = module or next((module for module in list(sys.modules) if _found(module, name) is value), "__main__")
-        self.modules.add(module)
+        self._meet(module)
         self._put("global", module, name)
         if _found(module, name) is not value:
             self._add_unknown(value)
@@ -387,7 +419,7 @@ class Digester:
             return ""
         if _found(module, name) is not value:
             return ""
-        self.modules.add(module)
+        self._meet(module)
         return f"{module}.{name}"
 
 
@@ -448,44 +480,27 @@ def _annotations(function: types.FunctionType) -> Mapping[str, Any]:
 
 
 def _is_installed(module: str) -> bool:
-    # Without its cache: a module may be loaded again from another place.
-    return module != "__main__" and not is_own.__wrapped__(module.partition(".")[0])
+    top = module.partition(".")[0]
+    if module == "__main__" or top in sys.modules:
+        # Without its cache: a module may be loaded again from another place.
+        return module != "__main__" and not is_own.__wrapped__(top)
+    with suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(top)
+        return spec is not None and not _INSTALLED.isdisjoint(Path(spec.origin or "").parts)
+    return False
 
 
-def versions_of(modules: Iterable[str], source: str = "") -> list[str]:
-    """Return a line for each module of these, and for each that those which are not installed import.
-
-    Parameters
-    ----------
-    modules
-        Their names.
-    source
-        Python whose imports count as well.
-
-    Returns
-    -------
-    list of str
-        Sorted. An installed module has the versions of its distributions, any other one the digest of its file.
-    """
-    waiting = sorted({*modules, *_imports(source.encode("utf-8", "surrogatepass"), "", False)})
+def versions_of(modules: Iterable[str]) -> list[str]:
+    """Return a line for each of these modules: the versions of its distributions, or the digest of its own file."""
     found = {"python": sys.version}
-    seen: set[str] = set()
-    while waiting:
-        name = waiting.pop()
+    for name in modules:
         top = name.partition(".")[0]
-        if name in seen or top in sys.stdlib_module_names:
-            continue
-        seen.add(name)
         if top == _OURS:
             found[top] = metadata.version(_OURS)
-        elif (spec := _spec(name)) is not None and spec.origin is not None:
-            if not _INSTALLED.isdisjoint(Path(spec.origin).parts):
-                found[top] = ", ".join(f"{one}=={metadata.version(one)}" for one in _distributions().get(top, ()))
-                continue
-            content = _content_of(spec.origin)
-            found[name] = hashlib.sha256(content).hexdigest()
-            is_package = spec.submodule_search_locations is not None
-            waiting += _imports(content if spec.origin.endswith(".py") else b"", name, is_package)
+        elif _is_installed(name) and top not in sys.stdlib_module_names:
+            found[top] = ", ".join(f"{one}=={metadata.version(one)}" for one in _distributions().get(top, ()))
+        elif file := getattr(sys.modules.get(name), "__file__", None):
+            found[name] = file_digest(Path(file))
     return sorted(f"{name} {version}" for name, version in found.items())
 
 
@@ -495,44 +510,16 @@ def _distributions() -> Mapping[str, list[str]]:
     return {name: sorted(set(found)) for name, found in metadata.packages_distributions().items()}
 
 
-def _content_of(file: str) -> bytes:
-    try:
-        return Path(file).read_bytes()
-    except OSError:
-        return b""
-
-
-def _spec(name: str) -> ModuleSpec | None:
-    """Return where a module is, without importing it or its packages; None if it is no module."""
-    spec = getattr(sys.modules.get(name), "__spec__", None)
-    if spec is not None:
-        return spec  # type: ignore[no-any-return]
-    package = name.rpartition(".")[0]
-    within = _spec(package) if package else None
-    if package and (within is None or within.submodule_search_locations is None):
-        return None
-    try:
-        return PathFinder.find_spec(name, None if within is None else within.submodule_search_locations)
-    except (ImportError, KeyError, ValueError):  # of a folder without __init__.py that is not imported yet
-        return None
-
-
-@lru_cache(512)
-def _imports(source: bytes, module: str, is_package: bool) -> tuple[str, ...]:
-    """Return the names of all that a module may import, wherever in it."""
-    try:
-        tree = ast.parse(source)
-    except (SyntaxError, ValueError):
-        return ()
-    package = module if is_package else module.rpartition(".")[0]
-    found: set[str] = {package} - {""}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            parts = package.split(".")
-            above = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
-            origin = ".".join(filter(None, (above, node.module)))
-            # A name that is taken from a package may be a module of it.
-            found |= {origin, *(f"{origin}.{alias.name}" for alias in node.names)} - {""}
-    return tuple(sorted(found))
+def _imported_within(codes: Iterable[types.CodeType], package: str) -> set[str]:
+    """Return the names of all that code in a package may import when it runs."""
+    found: set[str] = set()
+    for code in codes:
+        # Before each import statement, its level and the names that it takes are loaded.
+        steps = [one for one in dis.get_instructions(code) if one.opname in {*_LOADS_CONSTANT, "IMPORT_NAME"}]
+        for level, taken, step in zip(steps, steps[1:], steps[2:], strict=False):
+            if step.opname == "IMPORT_NAME":
+                with suppress(ImportError):  # a relative import beyond the package
+                    name = importlib.util.resolve_name("." * level.argval + step.argval, package)
+                    # A name that is taken from a package may be a module of it.
+                    found |= {name, *(f"{name}.{one}" for one in taken.argval or ())}
+    return found

@@ -107,9 +107,12 @@ def map_images(
         unless ``keep`` is given: so a map that was interrupted goes on.
     name
         What the series in the store is called; without, a digest of the graph, its hyperparameters and all that its
-        functions use: code, globals, attributes, modules. A graph that can't be written as text needs a name. Under
-        a name that is taken, other code or other hyperparameters are refused. Every item is run again if lists, dicts,
-        arrays or objects that functions use have changed, or if the content of one can't be digested.
+        functions use: code, globals, attributes, modules. Under a name that is taken, other code or other
+        hyperparameters are refused. Every item is run again if lists, dicts, arrays or objects that functions use have
+        changed, or if the content of one can't be compared. What functions read from files or the environment is not
+        compared. Where a function has a name such as ``open``, ``imread``, ``load`` or ``environ`` in its code, every
+        item is run again unless ``name`` is given: then give another one when a file or a variable has changed. What a
+        library reads by itself, the network and the clock are not recognised.
     progress
         Whether there is a bar; without, in a terminal and in a notebook.
     ahead

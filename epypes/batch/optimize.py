@@ -17,7 +17,7 @@ from epypes.batch.cache import (
     function_digest,
     graph_fingerprint,
     payload_digest,
-    source_of,
+    reader_text,
     value_digest,
 )
 from epypes.batch.cases import Case, cases_of, with_labels_read
@@ -417,14 +417,14 @@ def _digests(ways: Mapping[str, Callable[[], str]], *, is_named: bool) -> dict[s
             found[what] = way()
         except (EpypesError, NoDigest) as error:
             if not is_named:
-                text = f"What is searched has no name for the store. Nothing tells its {what} from others: {error}"
+                text = f"The search has no name for the store, and one can't be computed from its {what}: {error}"
                 raise ScaleError(f"{text}.\nGive one: name='...'.") from error
             found[what] = ""
     return found
 
 
 def _graph_digest(cg: CompGraph) -> str:
-    found = graph_fingerprint(cg, source_of(cg))
-    if found.unknown:
-        raise NoDigest(found.unknown)
+    found = graph_fingerprint(cg)
+    if found.unknown or found.reader:
+        raise NoDigest(found.unknown or reader_text(found.reader))
     return combined_digest("graph", found.code, found.state).hex()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gc
-import threading
+import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -227,16 +228,66 @@ def test_without_a_name_the_graph_and_its_hyperparameters_name_the_series(runner
         assert sorted((len(first), len(second))) == [1, 2]
 
 
-def test_a_graph_that_no_text_tells_from_others_wants_a_name(tmp_path):
-    lock = threading.Lock()
+def test_a_function_without_source_needs_no_name(tmp_path):
+    for factor in (1, 2, 1):
+        typed = {"__name__": "__main__"}
+        exec(f"def scaled(image):\n    return float(image.mean()) * {factor}\n", typed)
+        runner = ep.CompGraphRunner(ep.CompGraph({"scaled": typed["scaled"]}, {"scaled": ("image", "out")}))
+        assert values(ep.map(runner, levels(4), store=tmp_path / "r.sqlite"), "out") == [4.0 * factor]
+    with ep.Store(tmp_path / "r.sqlite") as store:
+        assert sorted(len(store.series("map", name)) for name in store.names("map")) == [1, 1]
 
-    def held(image):
-        with lock:
-            return 1
 
-    runner = ep.CompGraphRunner(ep.CompGraph({"held": held}, {"held": ("image", "out")}))
-    with pytest.raises(ScaleError, match="Give name="):
-        ep.map(runner, levels(1), store=tmp_path / "r.sqlite")
+def read_with_open(image):
+    with open("gain.txt") as file:
+        return float(image.mean()) * float(file.read())
+
+
+def read_with_pathlib(image):
+    return float(image.mean()) * float(Path("gain.txt").read_text())
+
+
+def read_with_numpy(image):
+    return float(image.mean()) * float(np.loadtxt("gain.txt"))
+
+
+def read_the_environment(image):
+    return float(image.mean()) * float(os.environ["GAIN"])
+
+
+def read_a_variable(image):
+    return float(image.mean()) * float(os.getenv("GAIN", "1"))
+
+
+def gain_of_the_environment():
+    return read_the_environment(np.ones(1))
+
+
+def read_in_a_helper(image):
+    return float(image.mean()) * gain_of_the_environment()
+
+
+READERS = [
+    read_with_open, read_with_pathlib, read_with_numpy, read_the_environment, read_a_variable, read_in_a_helper
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("function", READERS)
+def test_rows_of_a_function_that_reads_files_or_the_environment_are_reused_under_a_name_alone(
+    function, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": ("image", "out")}))
+
+    def mapped(gain, **options):
+        (tmp_path / "gain.txt").write_text(str(gain))
+        monkeypatch.setenv("GAIN", str(gain))
+        return values(ep.map(runner, levels(1), store=tmp_path / "r.sqlite", **options), "out")
+
+    for gain in (2, 5):
+        with pytest.warns(UserWarning, match=r"reads files or the environment .* run again. .* give name="):
+            assert mapped(gain) == [gain]
+    assert [mapped(gain, name="by hand") for gain in (7, 8)] == [[7.0], [7.0]]
 
 
 def test_arrays_are_compared_by_content(noted, calls, tmp_path):
