@@ -12,7 +12,7 @@ from typing import Any, Final
 from epypes.bundle.adapters import answer_with, payload_of
 from epypes.bundle.hyperparameters import read_stored_arrays
 from epypes.bundle.manifest import check_files, check_manifest
-from epypes.bundle.mutable_state import MutableState, lock_cached_values
+from epypes.bundle.mutable_state import MutableState, check_caches
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -96,7 +96,7 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
         settings = read_settings(folder / SETTINGS, enums, content)
         settings = replace(settings, hyperparameters={**settings.hyperparameters, **stored})
         own = {name: getattr(module, name) for name in settings.own}
-        lock_cached_values(vars(module))
+        check_caches(vars(module))
         ports = {name: port for name, port in own.items() if name != MAKER}
         state = MutableState({**module.func_dict, **ports})
         cg = _graph(module, state.guarded(module.func_dict), settings)
