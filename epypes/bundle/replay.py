@@ -24,7 +24,7 @@ from epypes.bundle.coverage import LineCoverage
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.manifest import environment
-from epypes.bundle.requirements import import_all_of, requirement_lines
+from epypes.bundle.requirements import imported_names, requirement_lines
 from epypes.errors import BundleError, EpypesError
 from epypes.run import CompGraphRunner
 from epypes.wire.samples import load_sample, save_sample
@@ -247,7 +247,7 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
         bundle = read_bundle(folder, sealed=is_sealed)
         access.also_in(bundle.settings.hyperparameters)
         report = replay(bundle, twice=twice)
-    named = import_all_of((folder / MODULE).read_text(encoding="utf-8"))
+    named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
     requirements = requirement_lines(named | (sys.modules.keys() - before))
     notes = (coverage.note,) if coverage.note else ()
     return replace(
