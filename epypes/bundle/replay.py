@@ -232,9 +232,9 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
     """Replay, or record anew, as the options say; a report has what was imported and opened unless ``--unwatched``."""
     is_sealed, twice = not {"--unsealed", "--record"} & {*options}, "--twice" in options
     if "--record" in options:
-        return record_again(read_bundle(folder, sealed=is_sealed))
+        return record_again(read_bundle(folder, compare=is_sealed))
     if "--unwatched" in options:
-        return replay(read_bundle(folder, sealed=is_sealed), twice=twice)
+        return replay(read_bundle(folder, compare=is_sealed), twice=twice)
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
         try:
@@ -244,7 +244,7 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
             break
     before = frozenset(sys.modules)
     with FileAccess(folder) as access, LineCoverage(folder / MODULE) as coverage:
-        bundle = read_bundle(folder, sealed=is_sealed)
+        bundle = read_bundle(folder, compare=is_sealed)
         access.also_in(bundle.settings.hyperparameters)
         report = replay(bundle, twice=twice)
     named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
