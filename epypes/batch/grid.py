@@ -13,7 +13,7 @@ from itertools import islice, pairwise, product
 from typing import Any, Final, Literal, get_args
 
 from epypes.batch.ranges import axis_of, bounded, shares
-from epypes.bundle.hyperparameters import range_of
+from epypes.catalog import range_of
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph, as_switch
 from epypes.hints import Param, as_param

@@ -313,7 +313,7 @@ def _unpacked(files: Mapping[str, bytes]) -> Bundle:
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
         # Its digest has come with it, and what was left out is in its manifest.
-        return read_bundle(Path(folder) / "graph", sealed=False)
+        return read_bundle(Path(folder) / "graph", compare=False)
 
 
 def _load_error(package: PackagedGraph, error: BaseException) -> str:

@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.bundle.hyperparameters import plain, range_of
-from epypes.catalog import parameter_names
+from epypes.catalog import parameter_names, plain, range_of
 from epypes.errors import ScaleError, UnknownName
 from epypes.hints import Param, Roi, as_param, odd_step, param_from_value
 from epypes.optional import optional_import

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.clone import clone_graph
-from epypes.bundle.code_snapshot import CodeSnapshot
 from epypes.bundle.compare import Difference, Tolerance, differences, is_noise
+from epypes.bundle.mutable_state import CodeSnapshot
 from epypes.errors import BundleError, InputMutated
 from epypes.graph import CompGraph, with_defaults
 from epypes.optional import optional_import

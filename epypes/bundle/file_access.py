@@ -12,32 +12,27 @@ import os
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, Self
 
-_SYSTEM: Final = ("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr")
-_SYSTEM_TOO: Final = ("/System", "/Library", "/var/cache", "/var/lib")
+_SYSTEM: Final = (
+    *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
+    *("/System", "/Library", "/var/cache", "/var/lib"),
+)
 _EVENTS: Final = frozenset({"open", "os.listdir", "os.scandir", "sqlite3.connect"})
 _WAY_OUT: Final = (
     "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
     "it into the data of a package that is installed and read it with importlib.resources."
 )
 _LONGEST: Final = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class Named:
-    """A text that may name a file, and where it stands."""
-
-    text: str
-    what: str
+# A text that may name a file, and what has it.
+_Named = tuple[str, str]
 
 
 class FileAccess:
-    """While its block runs, it is noted which files the bundle's functions open.
+    """Notes, while its block runs, which files the bundle's functions open.
 
     Parameters
     ----------
@@ -48,13 +43,14 @@ class FileAccess:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._is_on = False
-        self._files: dict[str, str] = {}
+        self._opened: dict[str, str] = {}
         self._made: set[str] = set()
+        self._before: dict[_Named, tuple[int, ...] | None] = {}
 
     def __enter__(self) -> Self:
         self._is_on = True
         sys.addaudithook(self._on_event)  # which can't be taken away again
-        self._before = {named: _state(named.text) for named in _named_in(self._folder)}
+        self._note(_texts_of(self._folder))
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -63,38 +59,43 @@ class FileAccess:
     def also_in(self, values: Mapping[str, Any]) -> None:
         """Look for names of files in values of hyperparameters too."""
         for token, value in values.items():
-            named = (Named(text, f"Hyperparameter {token!r} (pipeline.toml)") for text in _texts_in(value))
-            self._before |= {text: _state(text.text) for text in named}
+            self._note((text, f"Hyperparameter {token!r} (pipeline.toml)") for text in _texts_in(value))
+
+    def _note(self, named: Iterable[_Named]) -> None:
+        self._before |= {entry: _state(entry[0]) for entry in named}
 
     @property
     def files(self) -> tuple[str, ...]:
         """Why the bundle is not alone: a sentence for each file that is not its own."""
-        own = self._own_places()
-        opened = {path: what for path, what in self._files.items() if not _is_in(path, own) and path not in self._made}
-        found = [f"{what} opens {path}. {_WAY_OUT}" for path, what in opened.items()]
-        for named, before in self._before.items():
-            path = os.path.realpath(named.text)
-            # What is another one now was written, not read.
-            if before is None or path in opened or _is_in(path, own) or _state(named.text) != before:
-                continue
-            found.append(f"{named.what} names {named.text}, which is there. {_WAY_OUT}")
-        return tuple(found)
+        own = self._own_folders()
+        found = {
+            path: f"{what} opens {path}. {_WAY_OUT}"
+            for path, what in self._opened.items()
+            if path not in self._made and not _is_in(path, own)
+        }
+        for (text, what), before in self._before.items():
+            path = os.path.realpath(text) if before else ""
+            # A file that has changed meanwhile was written, not read.
+            if path and not _is_in(path, own) and _state(text) == before:
+                found.setdefault(path, f"{what} names {text}, which is there. {_WAY_OUT}")
+        return tuple(found.values())
 
-    def _own_places(self) -> tuple[str, ...]:
+    def _own_folders(self) -> set[str]:
         """Return the folders whose files are there wherever the bundle's requirements are."""
-        packages = [folder for module in [*sys.modules.values()] for folder in _folders_of(module)]
-        installed = [sys.prefix, sys.base_prefix, sys.exec_prefix, *sysconfig.get_paths().values()]
         home = Path("~").expanduser()
-        caches = [os.environ.get("XDG_CACHE_HOME", ""), home / ".cache", os.environ.get("XDG_CONFIG_HOME", "")]
-        places = [self._folder, os.getcwd(), *installed, *packages, *caches, home / ".config", *_SYSTEM, *_SYSTEM_TOO]
-        return tuple(
-            {os.path.realpath(str(place)) for place in places if str(place)} - {os.sep, os.path.realpath(home)}
-        )
+        packages = (module for name, module in [*sys.modules.items()] if "." not in name)
+        folders = [
+            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, sys.exec_prefix, *sysconfig.get_paths().values()),
+            *(folder for module in packages for folder in getattr(module, "__path__", ())),
+            *(home / ".cache", home / ".config", *_SYSTEM),
+            *filter(None, (os.environ.get(name) for name in ("XDG_CACHE_HOME", "XDG_CONFIG_HOME"))),
+        ]
+        return {os.path.realpath(folder) for folder in folders} - {os.sep, os.path.realpath(home)}
 
     def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
         if not self._is_on or event not in _EVENTS or not isinstance(given[0], str | bytes | os.PathLike):
             return
-        what = self._function_at_work()
+        what = self._running_function()
         if not what:
             return
         path = os.path.realpath(os.fsdecode(given[0]))
@@ -102,17 +103,20 @@ class FileAccess:
         if flags & os.O_TRUNC or not os.path.exists(path):
             self._made.add(path)
         elif not flags & os.O_WRONLY:
-            self._files.setdefault(path, what)
+            self._opened.setdefault(path, what)
 
-    def _function_at_work(self) -> str:
-        """Return which function of the bundle is at work; "" if none is, or a module is being imported by it."""
+    def _running_function(self) -> str:
+        """Return which function of the bundle is running; "" if none is, or it is importing a module."""
         frame: FrameType | None = sys._getframe(2)
         while frame is not None:
             file = frame.f_code.co_filename
             if file.startswith("<frozen importlib"):
                 return ""
             if Path(file).parent == self._folder:
-                return _place(frame.f_code.co_name, Path(file).name, frame.f_lineno)
+                name = frame.f_code.co_name
+                return (
+                    f"{'The module' if name == '<module>' else f'{name}()'} ({Path(file).name}, line {frame.f_lineno})"
+                )
             frame = frame.f_back
         return ""
 
@@ -120,32 +124,26 @@ class FileAccess:
 def named_here(folder: Path) -> list[str]:
     """Return a sentence for each text of a bundle that names a file in the current folder, which a replay has not."""
     return [
-        f"{named.what} names {named.text!r}, a file in the current folder here. The current folder is another one "
-        f"there. {_WAY_OUT}"
-        for named in _named_in(folder)
-        if _is_file_here(named.text)
+        f"{what} names {text!r}, a file in the current folder here. The current folder is another one there. {_WAY_OUT}"
+        for text, what in _texts_of(folder)
+        if text.strip("./ ") and not os.path.isabs(text)
+        if os.path.isfile(text) or (os.sep in text and os.path.isdir(text))
     ]
 
 
-def _named_in(folder: Path) -> list[Named]:
-    """Return the texts in a bundle's module, which may name a file."""
+def _texts_of(folder: Path) -> Iterator[_Named]:
+    """Give the strings in a bundle's module, but for those that nothing reads, as docstrings."""
     module = folder / "pipeline.py"
     try:
-        return [*_texts(ast.parse(module.read_bytes()), "<module>", module.name)]
+        tree = ast.parse(module.read_bytes())
     except (OSError, SyntaxError, ValueError):
-        return []
-
-
-def _texts(node: ast.AST, function: str, file: str) -> Iterator[Named]:
-    """Give the strings in a module, but for those that nothing reads, as docstrings."""
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
+        return
+    unread = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Constant) or node in unread or not isinstance(node.value, str):
             continue
-        if isinstance(child, ast.Constant) and isinstance(child.value, str) and child.value[:_LONGEST] == child.value:
-            if child.value.isprintable():
-                yield Named(child.value, _place(function, file, child.lineno))
-            continue
-        yield from _texts(child, child.name if isinstance(child, ast.FunctionDef | ast.ClassDef) else function, file)
+        if len(node.value) <= _LONGEST and node.value.isprintable():
+            yield node.value, f"The module ({module.name}, line {node.lineno})"
 
 
 def _texts_in(value: Any) -> Iterator[str]:
@@ -154,10 +152,6 @@ def _texts_in(value: Any) -> Iterator[str]:
     elif isinstance(value, dict | tuple | list):
         for part in value.values() if isinstance(value, dict) else value:
             yield from _texts_in(part)
-
-
-def _place(function: str, file: str, line: int) -> str:
-    return f"The module ({file}, line {line})" if function == "<module>" else f"{function}() ({file}, line {line})"
 
 
 def _state(path: str) -> tuple[int, ...] | None:
@@ -170,21 +164,5 @@ def _state(path: str) -> tuple[int, ...] | None:
     return None if is_common or not os.path.isabs(path) else (found.st_ino, found.st_size, found.st_mtime_ns)
 
 
-def _is_file_here(text: str) -> bool:
-    """Whether a text is the relative path of a file, or of a folder with a slash in its name."""
-    try:
-        is_there = os.path.isfile(text) or (os.sep in text and os.path.isdir(text))
-    except ValueError:
-        return False
-    return is_there and not os.path.isabs(text) and bool(text.strip(". /"))
-
-
-def _folders_of(module: Any) -> list[str]:
-    """Return the folders of a package; a module outside of one has none of its own."""
-    name = getattr(module, "__name__", "")
-    is_top = isinstance(name, str) and "." not in name
-    return [str(folder) for folder in getattr(module, "__path__", ())] if is_top else []
-
-
-def _is_in(path: str, places: tuple[str, ...]) -> bool:
-    return any(path == place or path.startswith(place.rstrip(os.sep) + os.sep) for place in places)
+def _is_in(path: str, folders: Iterable[str]) -> bool:
+    return any(path == folder or path.startswith(folder.rstrip(os.sep) + os.sep) for folder in folders)

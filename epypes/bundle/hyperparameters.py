@@ -1,28 +1,23 @@
-"""Hyperparameters in TOML: how a value is written and read back, and which values it may take.
+"""Hyperparameters in TOML: how a value is written and read back.
 
 What TOML has stands there as it is. Anything else is a table with its ``kind``: beside the value where the whole value
 is meant, as an inline table where it is inside a list or a table. Every entry is ready for JSON too.
 
 An array of more than MOST_NUMBERS numbers, as a calibrated map, is a file of the bundle, whose name stands in TOML.
-
-The range of a hyperparameter is what an annotation says, the branches of a switch, or what is usual for the functions
-that take it. What is usual is a ``soft`` range and forbids nothing.
 """
 
 from __future__ import annotations
 
 import enum
-import numbers
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
-from epypes.catalog import entry_of, parameter_names, uses, usual
-from epypes.graph import CompGraph, annotated_params, as_switch
-from epypes.hints import Param, Roi
+from epypes.catalog import plain
+from epypes.errors import BundleError
 from epypes.run.guard import is_plain_array
 
 # What a person still reads, and a line of a diff still shows.
@@ -30,7 +25,6 @@ MOST_NUMBERS: Final = 400
 ARRAYS_OF_HYPERPARAMETERS: Final = "hyperparameters"
 _KIND: Final = "kind"
 _SMALL: Final = range(-(2**63), 2**63)
-_DEEPEST: Final = 20
 
 
 class Unwritable(ValueError):
@@ -57,7 +51,7 @@ class StoredArray:
 
 
 def store_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return values with a StoredArray in the place of each array that is too large for text, and the arrays by file.
+    """Return values with a StoredArray for each array that is too large for text, and the arrays by file.
 
     Parameters
     ----------
@@ -83,23 +77,23 @@ def write_stored_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
         np.save(folder / file, array, allow_pickle=False)
 
 
-def read_stored_arrays(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the array, which can't be written to, of each value that is a StoredArray, by token."""
-    return {token: _stored(folder, value) for token, value in values.items() if type(value) is StoredArray}
+def load_array(path: Path, mmap_mode: Literal["r"] | None = None) -> Any:
+    """Return an array of a bundle, which can't be written to.
 
-
-def _stored(folder: Path, value: StoredArray) -> Any:
+    Raises
+    ------
+    BundleError
+        The file holds no array, or a part of one.
+    """
     import numpy as np
 
-    array = np.load(folder / value.file, allow_pickle=False)
-    array.flags.writeable = False
+    try:
+        array = np.load(path, mmap_mode, allow_pickle=False)
+        array.flags.writeable = False
+    except Exception as error:  # a broken header raises errors of many kinds
+        text = f"{path} is no array that NumPy can read: {error}. Promote the graph again."
+        raise BundleError(path, text) from error
     return array
-
-
-def plain(value: Any) -> Any:
-    """Return a scalar of NumPy's as Python's own, for what compares it."""
-    is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
-    return value.item() if is_scalar else value
 
 
 def alike(entry: Mapping[str, Any], value: Any) -> Any:
@@ -129,15 +123,16 @@ def written(value: Any) -> dict[str, Any]:
     Unwritable
         There is no entry for a value of this kind, or of this size.
     """
-    return _written(value, _DEEPEST)
+    try:
+        return _written(value)
+    except RecursionError:
+        raise Unwritable("nested too deep") from None
 
 
-def _written(value: Any, depth: int) -> dict[str, Any]:
-    if depth < 0:
-        raise Unwritable("nested too deep")
+def _written(value: Any) -> dict[str, Any]:
     write = _WRITERS.get(type(value))
     if write is not None:
-        return write(value, depth - 1)
+        return write(value)
     if is_plain_array(value):
         return _array(value)
     if _is_numpy_number(value):
@@ -151,9 +146,9 @@ def _written(value: Any, depth: int) -> dict[str, Any]:
     raise Unwritable(f"a {type(value).__name__}")
 
 
-def _part(value: Any, depth: int) -> Any:
+def _part(value: Any) -> Any:
     """Return a value as it stands inside a list or table."""
-    entry = _written(value, depth)
+    entry = _written(value)
     return entry if _KIND in entry else entry["value"]
 
 
@@ -223,39 +218,39 @@ def _of_number(number: Any) -> Any:
     """Return a number of NumPy's as the shortest one of Python's that makes it again."""
     whole = number.item()
     if number.dtype.kind != "f":
-        return _part(whole, 0)
+        return _part(whole)
     short = float(str(number))
-    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole, 0)
+    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole)
 
 
-def _as_it_is(value: Any, depth: int) -> dict[str, Any]:
+def _as_it_is(value: Any) -> dict[str, Any]:
     return {"value": value}
 
 
-def _text(value: str, depth: int) -> dict[str, Any]:
+def _text(value: str) -> dict[str, Any]:
     if any("\ud800" <= character <= "\udfff" for character in value):
         raise Unwritable("a text with half a character in it")
     return {"value": value}
 
 
-def _integer(value: int, depth: int) -> dict[str, Any]:
+def _integer(value: int) -> dict[str, Any]:
     return {"value": value} if value in _SMALL else {"value": hex(value), _KIND: "int"}
 
 
-def _sequence(value: Any, depth: int) -> dict[str, Any]:
-    items = [_part(item, depth) for item in value]
+def _sequence(value: Any) -> dict[str, Any]:
+    items = [_part(item) for item in value]
     return {"value": items} if type(value) is list else {"value": items, _KIND: type(value).__name__}
 
 
-def _set(value: Any, depth: int) -> dict[str, Any]:
-    items = sorted((_part(item, depth) for item in value), key=repr)
+def _set(value: Any) -> dict[str, Any]:
+    items = sorted((_part(item) for item in value), key=repr)
     return {"value": items, _KIND: type(value).__name__}
 
 
-def _mapping(value: dict[Any, Any], depth: int) -> dict[str, Any]:
+def _mapping(value: dict[Any, Any]) -> dict[str, Any]:
     if _KIND not in value and all(type(key) is str and fits(key) for key in value):
-        return {"value": {key: _part(item, depth) for key, item in value.items()}}
-    return {"value": [[_part(key, depth), _part(item, depth)] for key, item in value.items()], _KIND: "dict"}
+        return {"value": {key: _part(item) for key, item in value.items()}}
+    return {"value": [[_part(key), _part(item)] for key, item in value.items()], _KIND: "dict"}
 
 
 def _array(array: Any) -> dict[str, Any]:
@@ -303,14 +298,14 @@ def _read_stored(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> StoredAr
     return StoredArray(file)
 
 
-_WRITERS: Final[Mapping[type, Callable[[Any, int], dict[str, Any]]]] = {
-    type(None): lambda value, depth: {_KIND: "none"},
+_WRITERS: Final[Mapping[type, Callable[[Any], dict[str, Any]]]] = {
+    type(None): lambda value: {_KIND: "none"},
     bool: _as_it_is,
     int: _integer,
     float: _as_it_is,
     str: _text,
-    complex: lambda value, depth: {"value": [_part(value.real, 0), _part(value.imag, 0)], _KIND: "complex"},
-    bytes: lambda value, depth: {"value": value.hex(), _KIND: "bytes"},
+    complex: lambda value: {"value": [_part(value.real), _part(value.imag)], _KIND: "complex"},
+    bytes: lambda value: {"value": value.hex(), _KIND: "bytes"},
     tuple: _sequence,
     list: _sequence,
     set: _set,
@@ -332,68 +327,3 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], An
     "numpy": _read_number,
     "enum": _read_member,
 }
-
-
-def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:
-    """Return the values that a hyperparameter may take, of which its present one is one; None if nothing says so.
-
-    Values are any objects, so whatever one raises when it is compared, it has no range then.
-    """
-    number = plain(value)
-    for source in (_annotated, _selected, _by_function, _by_name):
-        try:
-            found = next((param for param in source(cg, token, number) if _holds(param, number)), None)
-        except Exception:  # noqa: S112
-            continue
-        if found is not None:
-            return _without_negative(found, number) if source in (_by_function, _by_name) else found
-    return None
-
-
-def _takers(cg: CompGraph, token: str) -> Iterator[tuple[Any, str]]:
-    """Give the functions that take a token, and what each calls it."""
-    for name in cg.digraph.consumers.get(token, ()):
-        function = cg.functions[name]
-        parameters, position = parameter_names(function), cg.func_inputs(name).index(token)
-        yield function, parameters[position] if position < len(parameters) else ""
-
-
-def _annotated(cg: CompGraph, token: str, value: Any) -> Iterator[Param | Roi]:
-    return annotated_params(cg, token)
-
-
-def _selected(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
-    for name in cg.digraph.consumers.get(token, ()):
-        found = as_switch(cg.functions[name])
-        if found is not None and cg.func_inputs(name)[0] == token:
-            yield Param(choices=found.branches)
-
-
-def _by_function(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
-    for function, parameter in _takers(cg, token):
-        known = [entry_of(function, parameter), *(use.entry for use in uses(function, parameter))]
-        yield from (param for param in (entry.resolved() for entry in known if entry) if param is not None)
-
-
-def _by_name(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
-    if isinstance(value, int | float | str):
-        names = dict.fromkeys([*(parameter for _, parameter in _takers(cg, token)), token])
-        yield from filter(None, (usual(name, value) for name in names if name))
-
-
-def _holds(param: Param | Roi, value: Any) -> bool:
-    """Whether a value is within a range of its own type: 1 is not True, and only integers are odd."""
-    if isinstance(param, Param) and param.choices is None:
-        if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            return False
-        return param.allows(value) and (isinstance(value, numbers.Integral) or not param.odd)
-    if isinstance(param, Param) and param.choices:
-        return isinstance(value, bool) == isinstance(param.choices[0], bool) and param.allows(value)
-    return param.allows(value)
-
-
-def _without_negative(param: Param | Roi, value: Any) -> Param | Roi:
-    """Return a range that offers no negative values to one that is not negative."""
-    if isinstance(param, Roi) or param.soft is None or value < 0 or param.soft[0] >= 0:
-        return param
-    return replace(param, soft=(type(param.soft[0])(0), max(param.soft[1], value)))

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
-from epypes.bundle.hyperparameters import read_stored_arrays
-from epypes.bundle.manifest import check_files, check_manifest
-from epypes.bundle.mutable_state import MutableState, lock_cached_values
+from epypes.bundle.hyperparameters import StoredArray, load_array
+from epypes.bundle.manifest import bundle_files, check_manifest
+from epypes.bundle.mutable_state import MutableState, check_caches
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -39,11 +39,11 @@ class Bundle:
     settings
         What stands in pipeline.toml.
     digest
-        Its digest; empty while it is not sealed.
+        Its digest; empty if its manifest was not compared.
     own
         What its module has of its own in place of the usual ports and pipeline, by the names in ``settings.own``.
     enums
-        The enumerations whose members are values of hyperparameters, by name; ``entries.read`` takes them.
+        The enumerations whose members are values of hyperparameters, by name.
     """
 
     path: Path
@@ -63,13 +63,20 @@ class Bundle:
         return f"<Bundle {self.settings.name!r:.30}: {ends:.40}>"
 
 
-def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
+def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
     """Read a bundle; its module's code is executed.
+
+    Parameters
+    ----------
+    path
+        Its folder.
+    compare
+        Whether its files have to be those of its manifest.
 
     Raises
     ------
     BundleError
-        A file was changed, is missing or was added, or the folder is no bundle.
+        A file was changed, is missing, was added or can't be read, or the folder is no bundle.
     GraphError
         The graph in its module is not valid.
     """
@@ -77,18 +84,23 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
     while True:
         before = _identity(folder)
         try:
-            if not sealed:
-                check_files(folder)
-            digest = check_manifest(folder) if sealed else ""
+            digest = check_manifest(folder) if compare else ""
+            for file in bundle_files(folder):
+                if file.endswith(".npy"):
+                    load_array(folder / file, "r")
             content, source = (folder / SETTINGS).read_bytes(), (folder / MODULE).read_bytes()
             settings = read_settings(folder / SETTINGS, content=content)
-            stored = read_stored_arrays(folder, settings.hyperparameters)
+            stored = {
+                token: load_array(folder / value.file)
+                for token, value in settings.hyperparameters.items()
+                if type(value) is StoredArray
+            }
             module = execute(folder / MODULE, source)
         except Exception:  # whatever the module's own code raises
             if _identity(folder) == before:
                 raise
             continue
-        # A promotion puts another folder in this one's place: then what was read, also by the module, may be of both.
+        # A promotion swaps another folder in: then what was read, also by the module, may be of both.
         if _identity(folder) == before:
             break
     try:
@@ -96,16 +108,14 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
         settings = read_settings(folder / SETTINGS, enums, content)
         settings = replace(settings, hyperparameters={**settings.hyperparameters, **stored})
         own = {name: getattr(module, name) for name in settings.own}
-        lock_cached_values(vars(module))
+        check_caches(vars(module))
         ports = {name: port for name, port in own.items() if name != MAKER}
         state = MutableState({**module.func_dict, **ports})
         cg = _graph(module, state.guarded(module.func_dict), settings)
         own |= {name: called_for(name, port) for name, port in state.guarded(ports).items()}
-    except AttributeError as error:
-        text = f"{folder / MODULE} defines no {error.name!r}. Promote the graph again."
-        raise BundleError(folder, text) from error
-    except (KeyError, TypeError) as error:
-        text = f"{folder / MODULE} has no {error} that {SETTINGS} names. Promote the graph again."
+    except (AttributeError, KeyError, TypeError) as error:
+        missing = repr(error.name) if isinstance(error, AttributeError) else error
+        text = f"{folder / MODULE} has no {missing} that {SETTINGS} names. Promote the graph again."
         raise BundleError(folder, text) from error
     return Bundle(folder, cg, settings, digest, own, enums)
 
@@ -119,7 +129,7 @@ def _graph(module: Any, functions: Mapping[str, Callable[..., Any]], settings: S
 
 
 def _identity(folder: Path) -> tuple[int, int] | None:
-    """Return what tells a folder from another one of its name, also from one that was there before."""
+    """Return what a folder has in common with no other of its name, also none that was there before."""
     try:
         found = folder.stat()
     except OSError:
@@ -133,7 +143,7 @@ def module_name(folder: Path) -> str:
 
 
 def execute(path: Path, source: bytes) -> Any:
-    """Execute the module's source as it was checked; a cached .pyc, which the seal does not cover, is not looked at."""
+    """Execute the module's source as it was checked; a cached .pyc, which the manifest does not cover, is not read."""
     module = types.ModuleType(module_name(path.parent))
     module.__file__ = str(path)
     # While their module runs, dataclasses look for it there.

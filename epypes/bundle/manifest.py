@@ -10,6 +10,7 @@ blocks, a device has no end, and a link leads out of the folder.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
 import os
@@ -25,8 +26,6 @@ from epypes.errors import BundleChanged, BundleError
 
 MANIFEST: Final = "MANIFEST.sha256"
 _TEXTS: Final = ("pipeline.py", "pipeline.toml", "requirements.txt")
-# What every manifest names.
-_NEEDED: Final = frozenset({"pipeline.py", "pipeline.toml"})
 # What a comment of the manifest begins with.
 _FACT: Final = "# "
 _LINES: Final = "lines of "
@@ -46,7 +45,7 @@ def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -
     environment
         What its samples have been recorded on; without, those of the manifest before stay.
     """
-    names = _files(folder)
+    names = bundle_files(folder)
     facts = dict(recorded_environment(folder) if environment is None else environment)
     facts |= {f"{_LINES}{name}": _sums(folder / name) for name in names if name in _TEXTS}
     lines = [f"{_FACT}{name}: {value}\n" for name, value in facts.items()]
@@ -72,11 +71,10 @@ def check_manifest(folder: Path) -> str:
     """
     if not os.path.lexists(folder / MANIFEST):
         raise BundleError(folder, _no_bundle(folder))
-    present = set(_files(folder))
-    recorded = _read_manifest(folder)
+    present = bundle_files(folder)
+    recorded, facts = _read_manifest(folder)
     findings = [f"{name} is missing" for name in recorded if name not in present]
-    findings += [f"{name} was added" for name in sorted(present - recorded.keys())]
-    facts = _facts(folder)
+    findings += [f"{name} was added" for name in present if name not in recorded]
     findings += [
         f"{name} was changed{_changed_line(folder, name, facts)}"
         for name, value in recorded.items()
@@ -88,42 +86,25 @@ def check_manifest(folder: Path) -> str:
     return digest(folder)
 
 
-def check_files(folder: Path) -> None:
-    """Check that a bundle whose manifest is not compared holds regular files only, within bounds.
-
-    Raises
-    ------
-    BundleError
-        Something else is named, or there is too much.
-    """
-    _files(folder)
-
-
 def why_no_bundle(folder: Path) -> str:
     """Return as a sentence why a folder is not a bundle and nothing else; "" if it is.
 
     A file that was changed or removed since is no reason; one that the manifest does not name is the user's own.
     """
-    no_bundle = f"{folder} exists and is not a bundle."
     try:
-        present = _files(folder)
+        present, (recorded, _) = bundle_files(folder), _read_manifest(folder)
     except BundleError as error:
-        return str(error)
-    try:
-        named = _read_manifest(folder)
-    except BundleError:
-        return no_bundle
-    if not named.keys() >= _NEEDED:
-        return no_bundle
-    foreign = [name for name in present if name not in named]
-    cached = (path for path in folder.rglob("__pycache__/*") if path.suffix != ".pyc")
-    foreign += [path.relative_to(folder).as_posix() for path in cached]
+        return f"{folder} exists and is not a bundle: {error}"
+    if not {"pipeline.py", "pipeline.toml"} <= recorded.keys():
+        return f"{folder} exists and is not a bundle."
+    foreign = [name for name in present if name not in recorded]
     return f"{folder} has files that are not the bundle's: {', '.join(foreign):.200}." if foreign else ""
 
 
 def recorded_environment(folder: Path) -> dict[str, str]:
-    """Return what the samples of a bundle were recorded on."""
-    return {name: value for name, value in _facts(folder).items() if not name.startswith(_LINES)}
+    """Return what the samples of a bundle were recorded on; nothing without a manifest."""
+    facts = _read_manifest(folder)[1] if os.path.lexists(folder / MANIFEST) else {}
+    return {name: value for name, value in facts.items() if not name.startswith(_LINES)}
 
 
 def _sums(path: Path) -> str:
@@ -153,36 +134,30 @@ def _no_bundle(folder: Path) -> str:
     return f"{folder} does not exist. Make a bundle with: epypes promote NOTEBOOK --to {folder}"
 
 
-def _manifest_lines(folder: Path) -> list[str]:
+def _read_manifest(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the digests of a manifest by file, and the facts in its comments by name."""
+    path = folder / MANIFEST
     try:
-        return (folder / MANIFEST).read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise BundleError(folder, f"{folder / MANIFEST} can't be read: {error}. Promote again.") from error
-
-
-def _facts(folder: Path) -> dict[str, str]:
-    lines = _manifest_lines(folder) if os.path.lexists(folder / MANIFEST) else []
-    facts = (line.removeprefix(_FACT).partition(": ") for line in lines if line.startswith(_FACT))
-    return {name: value for name, _, value in facts}
-
-
-def _read_manifest(folder: Path) -> dict[str, str]:
+        raise BundleError(folder, f"{path} can't be read: {error}. Promote again.") from error
     recorded: dict[str, str] = {}
-    for line in _manifest_lines(folder):
-        value, spaces, name = line.partition("  ")
+    facts: dict[str, str] = {}
+    for line in lines:
         if line.startswith(_FACT):
+            name, _, value = line.removeprefix(_FACT).partition(": ")
+            facts[name] = value
             continue
+        value, spaces, name = line.partition("  ")
         if not spaces:
-            raise BundleError(
-                folder, f"{folder / MANIFEST} can't be read: {line!r:.60} is no line of it. Promote again."
-            )
+            raise BundleError(folder, f"{path} can't be read: {line!r:.60} is no line of it. Promote again.")
         if recorded.setdefault(name, value) != value:
-            raise BundleError(folder, f"{folder / MANIFEST} has two digests for {name!r}. Promote again.")
-    return recorded
+            raise BundleError(folder, f"{path} has two digests for {name!r}. Promote again.")
+    return recorded, facts
 
 
-def _files(folder: Path) -> list[str]:
-    """Return everything but folders and the manifest; what is in __pycache__, which is never read, does not count.
+def bundle_files(folder: Path) -> list[str]:
+    """Return the names of a bundle's files, sorted: all but the manifest, and bytecode, which is never read.
 
     Raises
     ------
@@ -204,8 +179,8 @@ def _files(folder: Path) -> list[str]:
         total_bytes += status.st_size
         if total_bytes > MOST_BYTES:
             limit = f"{MOST_BYTES // 1024**3} GB"
-            raise BundleError(folder, f"{folder} holds more than {limit}, up to {name}. Keep large data elsewhere.")
-        if name.as_posix() != MANIFEST and "__pycache__" not in name.parts:
+            raise BundleError(folder, f"{folder} holds more than {limit}, up to {name}. Store large data elsewhere.")
+        if name.as_posix() != MANIFEST and not (name.parent.name == "__pycache__" and ".pyc" in name.suffixes):
             found.append(name)
     return [name.as_posix() for name in sorted(found)]
 
@@ -215,7 +190,6 @@ def _hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-_CPU_INFO: Final = Path("/proc/cpuinfo")
 # How each difference is named, by the name of what differs.
 _DIFFERENCES: Final = {
     "python": "another Python",
@@ -244,12 +218,12 @@ def environment() -> dict[str, str]:
 
 
 def _processor() -> str:
-    try:
-        lines = _CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor()) or f"{os.cpu_count()} of unknown kind"
+    """Return the processor's model, which Python does not know on Linux."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or f"{os.cpu_count()} of unknown kind"
 
 
 def environment_differences(recorded: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

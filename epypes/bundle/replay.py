@@ -24,7 +24,7 @@ from epypes.bundle.coverage import LineCoverage
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.manifest import environment
-from epypes.bundle.requirements import import_all_of, requirement_lines
+from epypes.bundle.requirements import imported_names, requirement_lines
 from epypes.errors import BundleError, EpypesError
 from epypes.run import CompGraphRunner
 from epypes.wire.samples import load_sample, save_sample
@@ -232,9 +232,9 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
     """Replay, or record anew, as the options say; a report has what was imported and opened unless ``--unwatched``."""
     is_sealed, twice = not {"--unsealed", "--record"} & {*options}, "--twice" in options
     if "--record" in options:
-        return record_again(read_bundle(folder, sealed=is_sealed))
+        return record_again(read_bundle(folder, compare=is_sealed))
     if "--unwatched" in options:
-        return replay(read_bundle(folder, sealed=is_sealed), twice=twice)
+        return replay(read_bundle(folder, compare=is_sealed), twice=twice)
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
         try:
@@ -244,10 +244,10 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
             break
     before = frozenset(sys.modules)
     with FileAccess(folder) as access, LineCoverage(folder / MODULE) as coverage:
-        bundle = read_bundle(folder, sealed=is_sealed)
+        bundle = read_bundle(folder, compare=is_sealed)
         access.also_in(bundle.settings.hyperparameters)
         report = replay(bundle, twice=twice)
-    named = import_all_of((folder / MODULE).read_text(encoding="utf-8"))
+    named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
     requirements = requirement_lines(named | (sys.modules.keys() - before))
     notes = (coverage.note,) if coverage.note else ()
     return replace(

@@ -1,4 +1,4 @@
-"""The packages of a bundle: those that its replay imports, their pins, and a fresh environment made of them."""
+"""The requirements of a bundle: the packages that its replay imports, their pins, and a fresh environment of them."""
 
 from __future__ import annotations
 
@@ -6,134 +6,118 @@ import ast
 import base64
 import contextlib
 import hashlib
-import importlib
 import importlib.util
 import json
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.utils import canonicalize_name
+
 from epypes.errors import BundleError
 
 REQUIREMENTS: Final = "requirements.txt"
 INSTALL_TIMEOUT_S: Final = 1200.0
-_LARGE_BYTES: Final = 4_000_000
 _OURS: Final = "epypes"
 # What EPypes needs to read samples; the rest of what it needs is for serving.
 _NEEDED: Final = ("numpy", "protobuf")
 _NO_NETWORK: Final = re.compile(
-    r"dns error|name resolution|failed to fetch|connection (refused|error|reset)|newconnectionerror|"
-    r"network is unreachable|tunneling|timed out|offline",
+    r"name resolution|connection (refused|error|reset)|newconnectionerror|"
+    r"network is unreachable|tunneling|timed out",
     re.IGNORECASE,
 )
-# uv keeps the wheels that it has built of folders, also when their code has changed.
-_REFRESHED: Final = ("--refresh-package", _OURS)
 _ADDRESSES: Final = re.compile(r"https?://\S+")
 
 
 # -- which distributions a bundle imports ----------------------------------------------------------------------------
 
 
-def import_all_of(text: str) -> frozenset[str]:
-    """Import what the statements of a module name, also those that no sample has come to; return the modules.
+def imported_names(text: str) -> frozenset[str]:
+    """Return the modules that the statements of a module import, also in lines that no sample runs.
 
-    What can't be imported is passed over: the module may have two ways, of which this machine has one.
+    Names that are imported from a module are among them: they may be modules too.
     """
-    named: list[tuple[str, tuple[str, ...]]] = []
+    found: set[str] = set()
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            named += ((alias.name, ()) for alias in node.names)
+            found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            named.append((node.module, tuple(alias.name for alias in node.names)))
-    for module, items in named:
-        with contextlib.suppress(Exception):
-            __import__(module, fromlist=items)
-    found = {module for module, _ in named} | {f"{module}.{item}" for module, items in named for item in items}
-    return frozenset(found & sys.modules.keys())
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return frozenset(found)
 
 
 def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:
-    """Return the lines of requirements.txt for modules that were imported: pinned, sorted, with comments.
+    """Return the lines of requirements.txt for modules and what their distributions require: pinned, sorted.
 
     What EPypes needs itself is not among them, unless a package of the bundle needs it too: it comes with EPypes.
+    Names that nothing on this machine has are passed over: the module may have two ways, of which this machine has one.
     """
-    names = {_distribution(name) for name in modules} - {"", _OURS}
-    waiting = [*names]
-    while waiting:
-        new = {name for name in _requires(waiting.pop()) if _is_loaded(name)} - names
-        names |= new
-        waiting += new
-    twins: dict[str, set[str]] = {}
+    # By distribution: those that have overwritten its files, or were overwritten by it.
+    twins: dict[str, set[str]] = {_OURS: set()}
     for module in modules:
-        twins.setdefault(_distribution(module), set()).update(_owners(module))
-    return tuple(line for name in sorted(names | {_OURS}) for line in _lines(name, twins.get(name, set()) - {name}))
+        owner, *others = _owners(module) or (_OURS,)
+        twins.setdefault(owner, set()).update(others)
+    waiting = [*twins.keys() - {_OURS}]
+    while waiting:
+        new = [name for name in _requires(waiting.pop()) if name not in twins]
+        twins |= {name: set() for name in new}
+        waiting += new
+    return tuple(line for name in sorted(twins) for line in _lines(name, twins[name]))
 
 
 def _requires(name: str) -> Iterator[str]:
-    """Give the names of the distributions that one needs, without those of its extras."""
-    for requirement in metadata.requires(name) or ():
-        text, _, marker = requirement.partition(";")
-        if "extra" not in marker:
-            yield normalized(re.split(r"[^\w.-]", text.strip(), maxsplit=1)[0])
-
-
-def _is_loaded(distribution: str) -> bool:
-    return any(distribution in found for top, found in _by_module().items() if top in sys.modules)
+    """Give the names of the installed distributions that one requires, without those of its extras."""
+    for text in metadata.requires(name) or ():
+        with contextlib.suppress(InvalidRequirement, metadata.PackageNotFoundError):
+            requirement = Requirement(text)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                yield canonicalize_name(metadata.distribution(requirement.name).name)
 
 
 @cache
-def _distribution(name: str) -> str:
-    """Return the normalized name of the distribution that owns the file of a module; "" if none does."""
-    top = name.partition(".")[0]
-    if top == _OURS:
-        return _OURS
-    candidates, file = bringing(top), _file(name)
-    if not file:
-        return ""
+def _owners(module: str) -> tuple[str, ...]:
+    """Return the distributions that have brought the file of a module, the one whose files are there now first."""
+    top, file = module.partition(".")[0], _file(module)
+    if top == _OURS or not file:
+        return (_OURS,) if top == _OURS else ()
+    candidates = bringing(top)
     if not candidates:
-        return next((found for folder, found in _editable().items() if _is_in(file, folder)), "")
+        return tuple(name for folder, name in _editable().items() if _is_in(file, folder))[:1]
+    if len(candidates) > 1:
+        candidates = tuple(name for name in candidates if file in _files(name)) or candidates
     # Each has overwritten the files of the others; the hashes in its record are of what it had brought.
-    return max(_owners(name) or candidates, key=lambda owner: sum(map(_agrees, _recorded(owner, top))))
-
-
-@cache
-def _owners(name: str) -> tuple[str, ...]:
-    """Return the distributions that have brought the file of a module; more than one if they overwrite each other."""
-    candidates, file = bringing(name.partition(".")[0]), _file(name)
-    if len(candidates) == 1 or not file:
-        return candidates if file else ()
-    return tuple(found for found in candidates if file in _files(found))
+    return tuple(sorted(candidates, key=lambda name: -_agreeing(name, top) if len(candidates) > 1 else 0))
 
 
 def bringing(top: str) -> tuple[str, ...]:
     """Return the normalized names of the distributions that bring a top-level module."""
-    return tuple(_by_module().get(top, ()))
+    return _by_module().get(top, ())
 
 
 @cache
-def _by_module() -> dict[str, list[str]]:
+def _by_module() -> dict[str, tuple[str, ...]]:
     # A distribution is listed once for each of its files' folders.
-    return {name: sorted({*map(normalized, found)}) for name, found in metadata.packages_distributions().items()}
+    found = metadata.packages_distributions().items()
+    return {top: tuple(sorted({*map(canonicalize_name, names)})) for top, names in found}
 
 
-def normalized(name: str) -> str:
-    """Return the name of a distribution as it is compared: lower case, with single dashes."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def _file(name: str) -> str:
-    module = sys.modules.get(name)
-    file = getattr(module, "__file__", None) or getattr(getattr(module, "__spec__", None), "origin", None)
-    return str(Path(file).resolve()) if isinstance(file, str) and Path(file).is_file() else ""
+def _file(module: str) -> str:
+    """Return the file of a module, which is not imported for it; its package is."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except Exception:  # it has none, or whatever its package raises
+        return ""
+    origin = spec.origin if spec else None
+    return str(Path(origin).resolve()) if origin and Path(origin).is_file() else ""
 
 
 def _is_in(file: str, folder: str) -> bool:
@@ -142,36 +126,33 @@ def _is_in(file: str, folder: str) -> bool:
 
 
 @cache
-def _files(distribution: str) -> frozenset[str]:
-    return frozenset(str(Path(str(path.locate())).resolve()) for path in metadata.files(distribution) or ())
+def _files(name: str) -> frozenset[str]:
+    return frozenset(str(Path(str(path.locate())).resolve()) for path in metadata.files(name) or ())
 
 
-def _recorded(distribution: str, top: str) -> list[Any]:
-    paths = metadata.files(distribution) or ()
-    return [path for path in paths if path.parts[0] == top and path.hash and (path.size or 0) < _LARGE_BYTES]
-
-
-def _agrees(path: Any) -> bool:
-    try:
-        content = Path(str(path.locate())).read_bytes()
-    except OSError:
-        return False
-    made = base64.urlsafe_b64encode(hashlib.new(path.hash.mode, content).digest()).decode().rstrip("=")
-    return bool(made == path.hash.value)
+def _agreeing(name: str, top: str) -> int:
+    """Return how many of a distribution's files have the content that it brought."""
+    count = 0
+    for path in metadata.files(name) or ():
+        if path.parts[0] == top and path.hash:
+            with contextlib.suppress(OSError):
+                content = hashlib.new(path.hash.mode, Path(str(path.locate())).read_bytes()).digest()
+                count += base64.urlsafe_b64encode(content).decode().rstrip("=") == path.hash.value
+    return count
 
 
 @cache
 def _editable() -> dict[str, str]:
-    """Return which distribution is installed as editable from which folder."""
-    found = {}
+    """Return the distributions that are installed as editable, by folder."""
+    found: dict[str, str] = {}
     for distribution in metadata.distributions():
-        source = install_source(distribution)
+        source = _install_source(distribution)
         if source.get("dir_info", {}).get("editable"):
-            found[str(Path(unquote(urlsplit(source["url"]).path)).resolve())] = normalized(distribution.name)
+            found[str(Path(unquote(urlsplit(source["url"]).path)).resolve())] = canonicalize_name(distribution.name)
     return found
 
 
-def install_source(distribution: metadata.Distribution) -> dict[str, Any]:
+def _install_source(distribution: metadata.Distribution) -> dict[str, Any]:
     """Return what PEP 610's direct_url.json says, {} for what comes from an index."""
     try:
         found = json.loads(distribution.read_text("direct_url.json") or "{}")
@@ -180,27 +161,25 @@ def install_source(distribution: metadata.Distribution) -> dict[str, Any]:
     return found if isinstance(found, dict) and isinstance(found.get("url"), str) else {}
 
 
-def _lines(name: str, twins: Collection[str]) -> list[str]:
+def _lines(name: str, twins: Collection[str]) -> Iterator[str]:
     distribution = metadata.distribution(name)
-    comments = []
-    source = install_source(distribution)
+    source = _install_source(distribution)
     if source:
-        how = (
-            "as editable, from a folder" if source.get("dir_info", {}).get("editable") else "from a file or an address"
-        )
-        comments.append(f"# {distribution.name} was installed {how}, not from an index: install it from there first.")
+        is_editable = source.get("dir_info", {}).get("editable")
+        how = "as editable, from a folder" if is_editable else "from a file or an address"
+        yield f"# {distribution.name} was installed {how}, not from an index: install it from there first."
     if "+" in distribution.version:
-        comments.append(f"# {distribution.version} is a local version: an index of its own has it.")
+        yield f"# {distribution.version} is a local version: an index of its own has it."
     if twins:
         both = f"{name} and {', '.join(sorted(twins))} are both installed and overwrite each other"
-        comments.append(f"# {both}: uninstall all but one. The files that were loaded are those of {name}.")
-    return [*comments, f"{distribution.name}=={distribution.version}"]
+        yield f"# {both}: uninstall all but one. The files that were loaded are those of {name}."
+    yield f"{distribution.name}=={distribution.version}"
 
 
 def pins(lines: Iterable[str]) -> dict[str, str]:
     """Return the version of each pinned distribution; comments and what is not pinned are passed over."""
     found = (re.fullmatch(r"\s*([\w.-]+)\s*==\s*([^\s;#]+).*", line) for line in lines)
-    return {normalized(pin[1]): pin[2] for pin in found if pin}
+    return {canonicalize_name(pin[1]): pin[2] for pin in found if pin}
 
 
 # -- a fresh environment ---------------------------------------------------------------------------------------------
@@ -215,23 +194,28 @@ def fresh_environment(folder: Path) -> Iterator[str]:
     BundleError
         No environment can be made, or something can't be installed.
     """
-    with tempfile.TemporaryDirectory(prefix="epypes-fresh-") as scratch:
-        home = Path(scratch) / "env"
-        until = time.monotonic() + INSTALL_TIMEOUT_S
-        for what, command in _steps(home, _wanted(folder)):
-            _run(folder, what, command, until - time.monotonic())
-        yield str(home / "bin" / "python")
-
-
-def _wanted(folder: Path) -> list[str]:
-    """Return what is to be installed, as pip takes it: the pins, EPypes, and what that needs for a replay."""
     try:
-        lines = (folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines()
+        pinned = pins((folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines())
     except (OSError, UnicodeDecodeError) as error:
         raise BundleError(folder, f"{folder / REQUIREMENTS} can't be read: {error}. Promote again.") from error
-    pinned = pins(lines)
+    with tempfile.TemporaryDirectory(prefix="epypes-fresh-") as scratch:
+        home = Path(scratch) / "env"
+        python = str(home / "bin" / "python")
+        pip = [python, "-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input"]
+        until = time.monotonic() + INSTALL_TIMEOUT_S
+        for what, command in (
+            ("A new environment can't be made", [sys.executable, "-I", "-m", "venv", str(home)]),
+            ("What requirements.txt names can't be installed", [*pip, *_wanted(pinned)]),
+        ):
+            _run(folder, what, command, until - time.monotonic())
+        yield python
+
+
+def _wanted(pinned: Mapping[str, str]) -> list[str]:
+    """Return what is to be installed, as pip takes it: the pins, EPypes, and what that needs for a replay."""
     named = [_source(name, version) for name, version in pinned.items() if name != _OURS]
-    needed = [requirement for name, requirement in _own_needs().items() if name not in pinned]
+    own = {Requirement(text).name: Requirement(text) for text in metadata.requires(_OURS) or ()}
+    needed = [f"{name}{own[name].specifier}" for name in _NEEDED if name in own and name not in pinned]
     return [*named, *needed, epypes_source(pinned)]
 
 
@@ -249,7 +233,7 @@ def _source(name: str, version: str) -> str:
         distribution = metadata.distribution(name)
     except metadata.PackageNotFoundError:
         return f"{name}=={version}"
-    source = install_source(distribution)
+    source = _install_source(distribution)
     # Another version than is installed here can only come from an index; of EPypes it is the one that runs now.
     if not source or (distribution.version != version and name != _OURS):
         return f"{name}=={version}"
@@ -260,38 +244,10 @@ def _source(name: str, version: str) -> str:
     return f"{name} @ {source['vcs_info']['vcs']}+{source['url']}@{commit}" if commit else f"{name} @ {source['url']}"
 
 
-def _own_needs() -> dict[str, str]:
-    """Return the requirements of EPypes' own that a replay needs, without their markers, by name."""
-    texts = [requirement.partition(";")[0].strip() for requirement in metadata.requires(_OURS) or ()]
-    by_name = {normalized(re.split(r"[^\w.-]", text, maxsplit=1)[0]): text for text in reversed(texts)}
-    return {name: by_name[name] for name in _NEEDED if name in by_name}
-
-
-def _steps(home: Path, wanted: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Return the commands that make the environment, each with what it does: uv where it is, else venv and pip."""
-    python = str(home / "bin" / "python")
-    made, installed = "A new environment can't be made", "What requirements.txt names can't be installed"
-    uv = uv_command()
-    if uv:
-        return [
-            (made, [*uv, "venv", "--quiet", "--no-project", "--python", sys.executable, str(home)]),
-            (installed, [*uv, "pip", "install", "--quiet", *_REFRESHED, "--python", python, *wanted]),
-        ]
-    pip = [python, "-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input"]
-    return [(made, [sys.executable, "-I", "-m", "venv", str(home)]), (installed, [*pip, *wanted])]
-
-
-def uv_command() -> list[str]:
-    """Return how uv is called on this machine; empty if it is not there."""
-    if importlib.util.find_spec("uv"):
-        return [sys.executable, "-m", "uv"]
-    path = shutil.which("uv")
-    return [path] if path else []
-
-
-def _run(folder: Path, what: str, command: Sequence[str], timeout_s: float) -> None:
+def _run(folder: Path, what: str, command: list[str], timeout_s: float) -> None:
+    """Run a command; raise BundleError with a sentence of why it failed, without the addresses of what it asked."""
     try:
-        done = subprocess.run(  # noqa: S603 - uv, venv or pip of this interpreter
+        done = subprocess.run(  # noqa: S603 - venv or pip of this interpreter
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=max(timeout_s, 0.0), check=False
         )
     except subprocess.TimeoutExpired as error:
@@ -299,13 +255,14 @@ def _run(folder: Path, what: str, command: Sequence[str], timeout_s: float) -> N
         raise BundleError(folder, f"{folder}: {text}") from error
     except OSError as error:
         raise BundleError(folder, f"{folder}: {what}: {error}.") from error
-    if done.returncode != 0:
-        raise BundleError(folder, f"{folder}: {_reason(what, done.stderr.decode(errors='replace'))}")
-
-
-def _reason(what: str, output: str) -> str:
-    """Return in one sentence why a command failed, without the addresses of what it asked."""
+    if done.returncode == 0:
+        return
+    output = done.stderr.decode(errors="replace")
     if _NO_NETWORK.search(output):
-        return f"{what}: no package index answers. Connect to the network, or verify without --fresh-env."
-    text = " ".join(_ADDRESSES.sub("...", output).split()) or "it printed nothing"
-    return f"{what}: {text[:300]}. Mend requirements.txt in a new promotion, or verify without --fresh-env."
+        reason = "no package index answers. Connect to the network, or verify without --fresh-env."
+    else:
+        # Around its errors, pip lists versions that do not fit and gives general advice.
+        errors = [line for line in output.splitlines() if re.match(r"\s*error: (?!Ignored)", line, re.IGNORECASE)]
+        text = " ".join(_ADDRESSES.sub("...", " ".join(errors) or output).split()) or "it printed nothing"
+        reason = f"{text[:300]}. Mend requirements.txt in a new promotion, or verify without --fresh-env."
+    raise BundleError(folder, f"{folder}: {what}: {reason}")

@@ -11,16 +11,8 @@ from typing import Any, Final
 
 from epypes.bundle.compare import Tolerance
 from epypes.bundle.determinism import add_tolerances, read_tolerances
-from epypes.bundle.hyperparameters import (
-    MOST_NUMBERS,
-    LargeArray,
-    Unwritable,
-    fits,
-    plain,
-    range_of,
-    read,
-    written,
-)
+from epypes.bundle.hyperparameters import MOST_NUMBERS, LargeArray, Unwritable, fits, read, written
+from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
 from epypes.graph import CompGraph
 from epypes.hints import Param
@@ -29,6 +21,9 @@ from epypes.optional import optional_import
 
 FORMAT: Final = 1
 _LINE: Final = 100
+_COMMENT: Final = (
+    "What the graph in pipeline.py is run with. The manifest covers it: change a value in the notebook and promote."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +86,7 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
             reasons.append(
                 f"{what} {token!r} is or holds {found}; {MOST_NUMBERS} are the most that pipeline.toml holds, where "
                 "people read them. Make each array a hyperparameter of its own, or let the function read it from "
-                "a variable of the notebook, outside of it: the bundle keeps either as a file. Or "
+                "a variable of the notebook, outside of it: the bundle has either as a file. Or "
                 "make it in a function; or unfreeze it and pass it to run()."
             )
         except Unwritable as found:
@@ -114,15 +109,9 @@ def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict
 
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     """Write pipeline.toml, with a comment per section and the ranges that annotations and usual names give."""
-    with optional_import():
-        import tomlkit
-
+    tomlkit = _tomlkit()
     document = tomlkit.document()
-    document.add(
-        tomlkit.comment(
-            "What the graph in pipeline.py is run with. It is sealed: change a value in the notebook and promote."
-        )
-    )
+    document.add(tomlkit.comment(_COMMENT))
     bundle = tomlkit.table()
     bundle.add("format", FORMAT)
     bundle.add("name", settings.name)
@@ -147,10 +136,15 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
-def _ports(settings: Settings) -> Any:
+def _tomlkit() -> Any:
     with optional_import():
         import tomlkit
 
+    return tomlkit
+
+
+def _ports(settings: Settings) -> Any:
+    tomlkit = _tomlkit()
     ports = tomlkit.table()
     ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
     ports.add("inputs", list(settings.inputs))
@@ -199,12 +193,9 @@ def _takers(cg: CompGraph, token: str) -> str:
 
 
 def _table(entry: Mapping[str, Any], comment: str = "") -> Any:
-    with optional_import():
-        import tomlkit
-
-    table = tomlkit.table()
+    table = _tomlkit().table()
     if comment and comment.isprintable():
-        table.add(tomlkit.comment(comment))
+        table.add(_tomlkit().comment(comment))
     for key, part in entry.items():
         table.add(key, _item(part))
     return table
@@ -212,16 +203,13 @@ def _table(entry: Mapping[str, Any], comment: str = "") -> Any:
 
 def _item(part: Any) -> Any:
     """Return a value for TOML: rows of a matrix, and what is long, on lines of their own."""
-    with optional_import():
-        import tomlkit
-
     if isinstance(part, dict):
-        table = tomlkit.inline_table()
+        table = _tomlkit().inline_table()
         table.update(part)
         return table
     if not isinstance(part, list):
         return part
-    item = tomlkit.array()
+    item = _tomlkit().array()
     item.extend(part)
     has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
     return item.multiline(True) if has_rows or len(item.as_string()) > _LINE else item

@@ -40,8 +40,8 @@ def write_back(
 ) -> WriteBack:
     """Write values of hyperparameters into a bundle's pipeline.toml, and record what its samples give with them.
 
-    The samples are run in an isolated process, replayed in another, and sealed; then the new bundle takes the place of
-    the old one in one step.
+    The samples are run in an isolated process and replayed in another; then the new bundle replaces the old one in one
+    step.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def _diff(before: str, after: str) -> str:
 
 
 def _record(draft: Path, target: Path, timeout_s: float) -> None:
-    """Record the outputs of a draft's samples again, replay and seal it."""
+    """Record the outputs of a draft's samples again, and prove it."""
     try:
         replay_isolated(draft, ["--record"], timeout_s=timeout_s)
         prove(draft, target, timeout_s)

@@ -11,7 +11,7 @@ from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
-from epypes.service.parameters import read_entries
+from epypes.service.parameters import entries_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,8 @@ def read_bundle_info(path: str | Path) -> BundleInfo:
     """
     folder = Path(path).resolve()
     digest = check_manifest(folder)
-    found = BundleInfo(folder, digest, read_settings(folder / SETTINGS), read_entries(folder / SETTINGS))
+    settings = read_settings(folder / SETTINGS)
+    found = BundleInfo(folder, digest, settings, entries_of(settings))
     # A promotion may have put another folder in its place meanwhile.
     if check_manifest(folder) != digest:
         raise BundleError(folder, f"{folder} was promoted anew while it was read. Try again.")

@@ -8,17 +8,16 @@ from __future__ import annotations
 import logging
 import math
 import threading
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.hyperparameters import written
-from epypes.errors import BundleError, ParametersRefused, RevisionConflict, ServiceError, UnknownName
+from epypes.errors import ParametersRefused, RevisionConflict, ServiceError, UnknownName
 
 if TYPE_CHECKING:
+    from epypes.bundle.settings import Settings
     from epypes.service.bundle_info import BundleInfo
     from epypes.service.dispatcher import Dispatcher
     from epypes.service.result_publisher import Listener
@@ -53,19 +52,9 @@ class Parameters:
     entries: Entries
 
 
-def read_entries(settings: Path) -> dict[str, dict[str, Any]]:
-    """Return the hyperparameters of a pipeline.toml with their ranges.
-
-    Raises
-    ------
-    BundleError
-        The file can't be read.
-    """
-    try:
-        document = tomllib.loads(settings.read_text(encoding="utf-8"))
-        return {token: _json_ready(entry) for token, entry in document.get("hyperparameters", {}).items()}
-    except (OSError, ValueError, AttributeError) as error:
-        raise BundleError(settings, f"{settings} can't be read: {error}.") from error
+def entries_of(settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return the hyperparameters of a bundle with their ranges, as JSON has them."""
+    return {token: _json_ready(entry) for token, entry in settings.entries.items()}
 
 
 def _json_ready(entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import io
+import pickle
 import shutil
 import sys
 
@@ -10,7 +12,8 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle import verify
+from epypes.bundle import verify, write_back
+from epypes.bundle.manifest import write_manifest
 from epypes.errors import BundleError, PromotionRefused
 from tests.bundle.cells import cell
 
@@ -52,11 +55,53 @@ def test_a_template_is_a_file_of_the_bundle_that_reads_as_the_notebook_wrote_it(
         template[0, 0] = 1
 
 
-def test_an_array_that_was_changed_breaks_the_seal(tmp_path):
+def test_an_array_that_was_changed_is_named(tmp_path):
     bundle = ep.promote(runner_of(MATCH)[0], tmp_path / "bundle")
     np.save(bundle.path / "arrays" / "TEMPLATE.npy", IMAGE)
     with pytest.raises(BundleError, match=r"arrays/TEMPLATE\.npy was changed"):
         ep.load(bundle.path)
+
+
+BROKEN = {
+    "cut off": lambda content: content[:400],
+    "empty": lambda content: b"",
+    "no array": lambda content: b"broken" * 100,
+    "a header that is no header": lambda content: content[:20] + b"(((" + content[23:],
+    "a pickle": lambda content: pickle.dumps([1, 2]),
+    "an archive": lambda content: archive(),
+}
+
+
+def archive():
+    content = io.BytesIO()
+    np.savez(content, a=IMAGE)
+    return content.getvalue()
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """A bundle with an array of its module, and one that is a hyperparameter."""
+    source = MATCH.replace("def match(image):", "def match(image, weights):").replace(
+        "_NORMED)", "_NORMED) + weights[0, 0]"
+    )
+    use = cell(source, {"__name__": "__main__", "IMAGE": IMAGE})["match"]
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"match": use}, {"match": (("image", "weights"), "out")}), {"weights": np.eye(30)}
+    )
+    runner.run(image=IMAGE)
+    return ep.promote(runner, tmp_path_factory.mktemp("stored") / "bundle").path
+
+
+@pytest.mark.parametrize("file", ["arrays/TEMPLATE.npy", "hyperparameters/weights.npy"])
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_array_is_named_when_the_manifest_covers_it_as_it_is(file, how, stored, tmp_path):
+    folder = shutil.copytree(stored, tmp_path / "bundle")
+    path = folder / file
+    path.write_bytes(BROKEN[how](path.read_bytes()))
+    write_manifest(folder)
+    for use in (ep.load, verify, lambda folder: write_back(folder, {"weights": np.eye(3)})):
+        with pytest.raises(BundleError, match=f"{file} is no array that NumPy can read: .*Promote the graph again"):
+            use(folder)
 
 
 def test_another_template_changes_no_line_of_the_text(tmp_path):

@@ -96,7 +96,7 @@ def test_settings_without_defaults_and_types_are_those_of_a_usual_graph(path, tm
     found = read_settings(settings)
     assert (dict(found.defaults), found.types) == ({}, True)
     with pytest.raises(GraphError, match="no value is both"):
-        read_bundle(copy, sealed=False)
+        read_bundle(copy, compare=False)
 
 
 @pytest.mark.parametrize("spoilt", ["[defaults]\ngain = 3", "[defaults.gain]\nlow = 3", "defaults = 3\n"])

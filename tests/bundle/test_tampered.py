@@ -119,7 +119,7 @@ def readers(folder):
         lambda: ep.load_pipeline(folder, None, None),
         lambda: Service(folder),
         lambda: write_back(folder, {"k": 7}),
-        lambda: read_bundle(folder, sealed=False),
+        lambda: read_bundle(folder, compare=False),
         lambda: ep.promote(runner, folder),
     ]
 

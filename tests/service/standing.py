@@ -8,7 +8,8 @@ import threading
 import uuid
 from contextlib import contextmanager
 
-from epypes.bundle.hyperparameters import plain, written
+from epypes.bundle.hyperparameters import written
+from epypes.catalog import plain
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.view import view
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from epypes.bundle.hyperparameters import Member, read
+from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError
-from epypes.service.parameters import changed_entries, misfits, read_entries, type_of, value_of
+from epypes.service.parameters import changed_entries, entries_of, misfits, type_of, value_of
 
 ENTRIES = {
     "side": {"value": 5, "low": 1, "high": 31, "odd": True, "unit": "px"},
@@ -87,12 +88,13 @@ def test_a_value_that_cannot_be_is_refused_with_the_reason(token, given, text):
 
 def test_entries_are_json_ready_whatever_the_file_says(tmp_path):
     file = tmp_path / "pipeline.toml"
-    file.write_text("[hyperparameters.k]\nvalue = 1.0\nlow = -inf\nhigh = 3\nsoft = [0, inf]\n")
-    assert read_entries(file) == {"k": {"value": 1.0, "high": 3}}
-    for text in ("hyperparameters = 3", "[", "[hyperparameters]\nk = 3"):
+    head = '[bundle]\nformat = 1\nname = "b"\n[ports]\ninputs = []\noutputs = ["y"]\n'
+    file.write_text(head + "[hyperparameters.k]\nvalue = 1.0\nlow = -inf\nhigh = 3\nsoft = [0, inf]\n")
+    assert entries_of(read_settings(file)) == {"k": {"value": 1.0, "high": 3}}
+    for text in ("[", f"{head}[hyperparameters]\nk = 3"):
         file.write_text(text)
         with pytest.raises(BundleError, match="can't be read"):
-            read_entries(file)
+            read_settings(file)
 
 
 GIVEN = {

@@ -19,7 +19,7 @@ from typing import Final
 
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest
-from epypes.bundle.requirements import epypes_source, pins, uv_command
+from epypes.bundle.requirements import epypes_source, pins
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
 from epypes.transport.address import is_broker, parse_address
@@ -253,18 +253,13 @@ def _add_wheel(target: Path, source: str) -> bool:
     if not Path(source).is_dir():
         return False
     wheels = str(target / "wheels")
-    uv = uv_command()
-    pip = [sys.executable, "-I", "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", wheels, source]
-    command = [*uv, "build", "--quiet", "--wheel", "--out-dir", wheels, source] if uv else pip
-    done = subprocess.run(  # noqa: S603 - uv or pip of this interpreter
+    command = [sys.executable, "-I", "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", wheels, source]
+    done = subprocess.run(  # noqa: S603 - pip of this interpreter
         command, stdin=subprocess.DEVNULL, capture_output=True, check=False
     )
     if done.returncode != 0:
         output = " ".join(done.stderr.decode(errors="replace").split())[-300:]
-        way_out = "Connect to the network, or install uv."
-        raise ServiceError(target, f"No wheel can be built of {source}: {output}. {way_out}")
-    # uv leaves one for version control.
-    (target / "wheels" / ".gitignore").unlink(missing_ok=True)
+        raise ServiceError(target, f"No wheel can be built of {source}: {output}. Connect to the network.")
     return True
 
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote
 
 from epypes.bundle.adapters import in_order
-from epypes.bundle.hyperparameters import plain, written
+from epypes.bundle.hyperparameters import written
 from epypes.bundle.writeback import WriteBack
+from epypes.catalog import plain
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.failures.record import FailedEvent, read_record
 from epypes.service.parameters import Parameters

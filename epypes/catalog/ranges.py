@@ -1,0 +1,78 @@
+"""The range of a hyperparameter, from the functions of a graph that take it.
+
+It is what an annotation says, the branches of a switch, or what is usual for the library functions that get the value,
+or for its name. What is usual is a ``soft`` range and forbids nothing.
+"""
+
+from __future__ import annotations
+
+import numbers
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+from epypes.catalog.calls import parameter_names, uses
+from epypes.catalog.lookup import entry_of, usual
+from epypes.graph import CompGraph, annotated_params, as_switch
+from epypes.hints import Param, Roi
+
+
+def plain(value: Any) -> Any:
+    """Return a scalar of NumPy's as Python's own, to be compared."""
+    is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
+    return value.item() if is_scalar else value
+
+
+def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:
+    """Return the values that a hyperparameter may take, of which its present one is one; None if nothing says so."""
+    number = plain(value)
+    for hint in _hints(cg, token):
+        # Values are any objects; one that can't be compared has no range.
+        with suppress(Exception):
+            if _holds(hint, number):
+                return hint
+    for hint in _usual(cg, token, number):
+        with suppress(Exception):
+            if _holds(hint, number):
+                return _without_negative(hint, number)
+    return None
+
+
+def _hints(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
+    """Give what annotations and switches say."""
+    yield from annotated_params(cg, token)
+    for name in cg.digraph.consumers.get(token, ()):
+        found = as_switch(cg.functions[name])
+        if found is not None and cg.func_inputs(name)[0] == token:
+            yield Param(choices=found.branches)
+
+
+def _usual(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
+    """Give what is usual for the functions that get a value, then what is usual for its names."""
+    names: dict[str, None] = {}
+    for name in cg.digraph.consumers.get(token, ()):
+        function, position = cg.functions[name], cg.func_inputs(name).index(token)
+        parameter = dict(enumerate(parameter_names(function))).get(position, "")
+        names[parameter] = None
+        entries = [entry_of(function, parameter), *(use.entry for use in uses(function, parameter))]
+        yield from filter(None, (entry.resolved() for entry in entries if entry))
+    if isinstance(value, int | float | str):
+        yield from filter(None, (usual(name, value) for name in (*names, token) if name))
+
+
+def _holds(hint: Param | Roi, value: Any) -> bool:
+    """Whether a value is within a range of its own type: 1 is not True, and only integers are odd."""
+    if isinstance(hint, Param) and hint.choices is None:
+        is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        return is_number and hint.allows(value) and (isinstance(value, numbers.Integral) or not hint.odd)
+    if isinstance(hint, Param) and hint.choices:
+        return isinstance(value, bool) == isinstance(hint.choices[0], bool) and hint.allows(value)
+    return hint.allows(value)
+
+
+def _without_negative(hint: Param, value: Any) -> Param:
+    """Return a range that offers no negative values to one that is not negative."""
+    if hint.soft is None or value < 0 or hint.soft[0] >= 0:
+        return hint
+    return replace(hint, soft=(type(hint.soft[0])(0), max(hint.soft[1], value)))
