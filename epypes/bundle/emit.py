@@ -6,25 +6,30 @@ import enum
 import functools
 import itertools
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import noted_refusals
-from epypes.bundle.graphs import Graphs, GraphText
+from epypes.bundle.expressions import expression
+from epypes.bundle.graphs import Graphs, GraphText, arguments_of, parameters_of
 from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.load import MAKER
 from epypes.bundle.module import module_text
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings
-from epypes.bundle.slice import Slice
-from epypes.bundle.subject import Subject, own_lines
-from epypes.bundle.syntax import LINE, one_per_line, quoted
+from epypes.bundle.slice import Slice, gather
+from epypes.bundle.syntax import LINE, laid_out, one_per_line, quoted
 from epypes.errors import run_call
 from epypes.graph import CompGraph
-from epypes.pipeline import FullPipeline
+from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 
+if TYPE_CHECKING:
+    from epypes.bundle.promote import Subject
+
+# What the function that makes a pipeline is given, and hands on to the class.
+_GIVEN: Final = ("cg", "q_in", "q_out", "f_in", "f_out", "hparams")
+PIPELINES: Final = (Pipeline, SourcePipeline, SinkPipeline, FullPipeline)
 # The folder is wherever the bundle is: it may be moved.
 _TEXT: Final = '''"""{title}
 
@@ -38,35 +43,26 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 """'''
 
 
-def write_module(
-    subject: Subject, settings: Settings, uncalled: Collection[int] = ()
-) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against.
+def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against."""
 
-    Closures whose ids are in ``uncalled`` are written with what they have captured, not as calls of their factories.
-    """
-    gathered = Slice(keeps_arrays=True, uncalled=uncalled)
-    graphs = Graphs(gathered)
-    ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
-    text = graphs.write(subject.cg, {**ports, **subject.classes})
-    own = dict(own_lines(gathered, graphs, subject))
-    if settings.has_groups:
-        with noted_refusals(gathered):
-            gathered.keep_name("func_groups")
-    blocks = [*filter(None, own.values()), *_enums(gathered, settings)]
+    def write(gathered: Slice) -> tuple[GraphText, Graphs, dict[str, list[str]], list[list[str]]]:
+        graphs = Graphs(gathered)
+        text = graphs.write(subject.cg)
+        own = dict(_own_lines(gathered, graphs, subject))
+        if settings.has_groups:
+            with gathered.noted_refusals():
+                gathered.reserve("func_groups")
+        return text, graphs, own, _enums(gathered, settings)
+
+    gathered, (text, graphs, own, enums) = gather(write, keeps_arrays=True)
     settings = replace(settings, own=tuple(own))
-    if gathered.refusals and gathered.called:
-        again = write_module(subject, settings, {*uncalled, *gathered.called})
-        if not again[3]:
-            return again
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))
-    text_of_all = emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks)
-    pairs = functools.partial(_pairs, subject, settings)
-    why, closure = refusal(text_of_all, gathered.arrays.by_name, pairs, gathered.called)
-    if closure:
-        return write_module(subject, settings, {*uncalled, closure})
-    return text_of_all, settings, gathered.arrays.by_name, [why] if why else []
+    arrays = gathered.arrays.by_name
+    module = emit_module(settings, subject.cg, gathered, text, graphs.blocks, [*filter(None, own.values()), *enums])
+    why, _ = refusal(module, arrays, functools.partial(_pairs, subject, settings))
+    return module, settings, arrays, [why] if why else []
 
 
 def _pairs(subject: Subject, settings: Settings, module: Any) -> Iterator[Pair]:
@@ -90,14 +86,14 @@ def _enums(gathered: Slice, settings: Settings) -> list[list[str]]:
     """Return the lines that name the enumerations whose members stand in pipeline.toml."""
     found: dict[str, str] = {}
     for kind in _enums_in(settings):
-        with noted_refusals(gathered):
-            reference = gathered.add_class(kind, None, f"Class {kind.__name__!r} of a hyperparameter")
+        with gathered.noted_refusals():
+            reference = gathered.add_class(kind, f"Class {kind.__name__!r} of a hyperparameter")
             if found.setdefault(kind.__qualname__, reference) != reference:
                 raise Refused(f"Two hyperparameters are of two classes called {kind.__name__!r}. Rename one.")
     if not found:
         return []
-    with noted_refusals(gathered):
-        gathered.keep_name("enums")
+    with gathered.noted_refusals():
+        gathered.reserve("enums")
     items = [(f"{quoted(name)}: ", reference) for name, reference in found.items()]
     return [["# Whose members stand in pipeline.toml.", *one_per_line("enums = {", items, "}")]]
 
@@ -165,3 +161,80 @@ def _docstring(settings: Settings) -> str:
 def _escaped(text: str) -> str:
     """Return text as it may stand between triple quotes: names are data, whatever they hold."""
     return json.dumps(text)[1:-1]
+
+
+# -- what a bundle has of its own -------------------------------------------------------------------------------------
+
+
+def _own_lines(gathered: Slice, graphs: Graphs, subject: Subject) -> Iterator[tuple[str, list[str]]]:
+    """Give what the module has of its own in place of what a bundle usually does, by name; refusals are gathered."""
+    comments = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
+    for name, function in subject.ports.items():
+        reference = graphs.value(function, f"Function {name!r}", name)
+        if reference == name:
+            yield name, []
+            continue
+        with gathered.noted_refusals():
+            gathered.reserve(name)
+        yield name, [comments[name], f"{name} = {reference}"]
+    if subject.pipeline is not None and type(subject.pipeline) not in PIPELINES:
+        with gathered.noted_refusals():
+            gathered.reserve(MAKER)
+            yield MAKER, _maker(gathered, subject.pipeline)
+
+
+def _maker(gathered: Slice, pipeline: Pipeline) -> list[str]:
+    """Return the function that makes the pipeline of a user's class."""
+    kind, what = type(pipeline), f"Pipeline {pipeline.name!r}"
+    known = gathered.add_class(kind, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}")
+    lines: list[str] = []
+    if not isinstance(pipeline, FullPipeline):
+        known, lines = _answering(gathered, kind, known, what)
+        arguments = [quoted(pipeline.name), *_GIVEN]
+    else:
+        arguments = _arguments(gathered, pipeline, what)
+    made = f"{known}({', '.join(arguments)})"
+    head = f"def {MAKER}({', '.join(_GIVEN)}):"
+    return [*lines, head, '    """Return the pipeline that answers events."""', *laid_out(made, 1, "return ")]
+
+
+def _arguments(gathered: Slice, pipeline: Pipeline, what: str) -> list[str]:
+    taken = [parameter.name for parameter in parameters_of(type(pipeline))]
+    for name in ("cg", "q_in", "q_out", "hparams"):
+        if name not in taken:
+            text = f"{what} is of class {type(pipeline).__name__!r}, whose __init__ does not take {name!r}"
+            raise Refused(f"{text}. Take it, and hand it on: super().__init__(..., {name}={name}).")
+    arguments: list[str] = []
+    given = arguments_of(pipeline, what)
+    for name in taken:
+        if name in _GIVEN:
+            arguments.append(f"{name}={name}")
+        elif name in given:
+            source = expression(gathered, given[name], what)
+            if not source:
+                text = f"{what} is made with {name!r}, a {type(given[name]).__name__} that no expression makes again"
+                raise Refused(f"{text}. Make it in __init__, from numbers, strings or tuples of them.")
+            arguments.append(f"{name}={source}")
+    return arguments
+
+
+def _answering(gathered: Slice, kind: type[Pipeline], known: str, what: str) -> tuple[str, list[str]]:
+    """Return the name of a class that does what a user's pipeline does and answers events, and its definition."""
+    way_out = "Make it a subclass of ep.FullPipeline."
+    if issubclass(kind, SourcePipeline):
+        raise Refused(f"{what} is of class {kind.__name__!r}, a SourcePipeline, which takes no events. {way_out}")
+    usual = SinkPipeline if issubclass(kind, SinkPipeline) else Pipeline
+    if getattr(kind, "emit", None) is not getattr(usual, "emit", None):
+        raise Refused(f"{what} is of class {kind.__name__!r}, whose emit() a service would not call. {way_out}")
+    if [parameter.name for parameter in parameters_of(kind)] != [parameter.name for parameter in parameters_of(usual)]:
+        text = f"{what} is of class {kind.__name__!r}, whose __init__ takes what a service can't give."
+        raise Refused(f"{text} {way_out}")
+    name = f"Answering{kind.__name__}"
+    gathered.reserve(name)
+    full = f"{gathered.module_name('epypes', what)}.FullPipeline"
+    return name, [
+        f"class {name}({full}, {known}):",
+        f'    """{kind.__name__}, driven by events."""',
+        "",
+        "",
+    ]

@@ -5,58 +5,26 @@ from __future__ import annotations
 import ast
 import itertools
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from epypes.bundle.classes import ClassDefinition
-from epypes.bundle.definitions import Definition
-from epypes.bundle.notebook_source import Statement, cell_of, is_comment, parsed, statements_of
+from epypes.bundle.notebook_source import Statement, is_comment, parsed, statements_of
 from epypes.bundle.syntax import LINE, UNKNOWN, is_data, is_same_data, laid_out, literal_value
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
     from epypes.bundle.slice import Slice
 
-
-AnyDefinition = Definition | ClassDefinition
-# The number of the cell, that of the file, the line.
+# The number of the cell, the line.
 Position = tuple[int, ...]
 
 
-class Positions:
-    """Where definitions stand: in cells and lines; without a notebook, in files as they were met, and lines."""
-
-    def __init__(self) -> None:
-        self._files: dict[str, int] = {}
-        self._first: AnyDefinition | None = None
-
-    def learn(self, found: AnyDefinition) -> None:
-        """Take the notebook's names from the first definition."""
-        self._first = self._first or found
-
-    @property
-    def notebook(self) -> Mapping[str, Any]:
-        """The names of the notebook; none before anything of it was found."""
-        return self._first.names if self._first else {}
-
-    def names_with(self, kind: type) -> Mapping[str, Any]:
-        """Return the names of the notebook that has a class."""
-        return self.notebook if self.notebook.get(kind.__name__) is kind else vars(sys.modules["__main__"])
-
-    def of_definition(self, found: AnyDefinition) -> Position:
-        """Return where a function or class was defined."""
-        cell = cell_of(found.file, found.names)
-        return cell, 0 if cell else self._files.setdefault(found.file, len(self._files)), found.line
-
-    def of_name(self, name: str) -> Position:
-        """Return where the notebook gave a name its value, () if its text does not say."""
-        given = next(statements_of(name, self.notebook, self._first.file if self._first else ""), None)
-        return (given.cell, 0, given.node.lineno) if given else ()
-
-
 def ordered(
-    texts: Mapping[str, str], positions: Mapping[str, Position], reads: Mapping[str, frozenset[str]]
+    texts: Mapping[str, str],
+    positions: Mapping[str, Position],
+    reads: Mapping[str, frozenset[str]],
+    closures: Collection[str],
 ) -> list[str]:
     """Return the names of definitions in the order in which they stand in a module.
 
@@ -68,10 +36,12 @@ def ordered(
         Where they stand in the notebook, as far as that is known; others stand before what needs them, or at the end.
     reads
         The names that definitions read from outside, as far as that is known; of others, all that they mention.
+    closures
+        The names of closures: what makes them calls nothing of what it is given.
     """
     trees = {name: parsed(text) or ast.Module([], []) for name, text in texts.items()}
     mentioned = {name: reads[name] if name in reads else _names(ast.walk(tree)) for name, tree in trees.items()}
-    needs = {name: _needs(name, tree, mentioned) for name, tree in trees.items()}
+    needs = {name: _needs(name, tree, mentioned, name in closures) for name, tree in trees.items()}
     found: dict[str, None] = {}
     begun: set[str] = set()
     pending = sorted(texts, key=lambda name: (name not in positions, positions.get(name, ())))[::-1]
@@ -85,11 +55,13 @@ def ordered(
     return list(found)
 
 
-def _needs(name: str, tree: ast.Module, mentioned: Mapping[str, frozenset[str]]) -> set[str]:
+def _needs(name: str, tree: ast.Module, mentioned: Mapping[str, frozenset[str]], is_closure: bool) -> set[str]:
     """Return the definitions that importing one reads; what it calls may read all that it mentions."""
     read = [part for statement in tree.body for part in _read_at_import(statement)]
     found = set(_names(iter(read)) & mentioned.keys())
-    if any(isinstance(part, ast.Call | ast.ClassDef) or getattr(part, "decorator_list", []) for part in read):
+    if not is_closure and any(
+        isinstance(part, ast.Call | ast.ClassDef) or getattr(part, "decorator_list", []) for part in read
+    ):
         pending = list(found)
         while pending:
             more = (mentioned[pending.pop()] & mentioned.keys()) - found
@@ -133,25 +105,6 @@ class Remark:
     statement: str = ""
 
 
-def imported_as(name: str, value: Any, names: Mapping[str, Any], file: str) -> tuple[str, str]:
-    """Return the module from which a notebook imported a value, and what it is called there; else empty strings."""
-    for statement in statements_of(name, names, file):
-        node = statement.node
-        if not isinstance(node, ast.ImportFrom) or node.level or not node.module:
-            return "", ""
-        own = next((alias.name for alias in node.names if (alias.asname or alias.name) == name), name)
-        there = getattr(sys.modules.get(node.module), own, UNKNOWN)
-        return (node.module, own) if _is_same(there, value) else ("", "")
-    stars = (statement.node for statement in statements_of("*", names, file))
-    modules = (node.module for node in stars if isinstance(node, ast.ImportFrom) and not node.level)
-    found = (module for module in modules if _is_same(getattr(sys.modules.get(module or ""), name, UNKNOWN), value))
-    return next(((module, name) for module in found if module), ("", ""))
-
-
-def _is_same(one: Any, other: Any) -> bool:
-    return one is other or is_same_data(one, other)
-
-
 def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], file: str) -> Remark | None:
     """Return what a notebook says where it last gave a name this value; None if it does not say it.
 
@@ -166,11 +119,10 @@ def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], file
     """
     for statement in statements_of(name, names, file):
         given = getattr(statement.node, "value", None)
-        if not isinstance(given, ast.expr):
-            continue
-        written = literal_value(given) if _is_assignment_to(name, statement.node) else UNKNOWN
-        if written is UNKNOWN or is_same_data(written, value):
-            return _remark(name, value, source, given, statement, written is not UNKNOWN)
+        if isinstance(given, ast.expr):
+            written = literal_value(given) if _is_assignment_to(name, statement.node) else UNKNOWN
+            if written is UNKNOWN or is_same_data(written, value):
+                return _remark(name, value, source, given, statement, written is not UNKNOWN)
     return None
 
 
@@ -183,7 +135,7 @@ def _is_assignment_to(name: str, node: ast.stmt) -> bool:
 
 def _remark(name: str, value: Any, source: str, given: ast.expr, statement: Statement, is_known: bool) -> Remark:
     node, lines = statement.node, statement.lines
-    position = (statement.cell, 0, node.lineno)
+    position = (statement.cell, node.lineno)
     if not _is_assignment_to(name, node):
         return Remark(position)
     first = number = node.lineno - 1
@@ -214,7 +166,7 @@ def constant_lines(name: str, source: str, remark: Remark | None) -> list[str]:
 
 def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
     """Return the text of a module: what stands at its head, what its functions need, and what stands behind that."""
-    texts = {name: found.text.rstrip() for name, found in needed.definitions.items()}
+    texts = {name: text.rstrip() for name, text in needed.definitions.items()}
     positions = {**needed.positions, **{name: remark.position for name, remark in needed.remarks.items()}}
     early: list[str] = []
     for name in sorted(needed.constants, key=lambda name: (name not in needed.remarks, positions.get(name, ()))):
@@ -230,7 +182,7 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
     sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]
     if reader:
         sections += [reader, *constants]
-    names = ordered(texts, positions, needed.reads)
+    names = ordered(texts, positions, needed.reads, needed.closures)
     for are_constants, group in itertools.groupby(names, needed.constants.__contains__):
         found = [texts[name] for name in group]
         sections += ["\n".join(found)] if are_constants else found
