@@ -31,6 +31,10 @@ _CELL_MAGIC: Final = "get_ipython().run_cell_magic("
 _EXECUTING: Final = ("capture", "time", "prun")
 
 
+# The number of the cell, the line.
+Position = tuple[int, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class Statement:
     """A statement that gives names their values.
@@ -270,13 +274,12 @@ def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
 
 def own_text(lines: list[str], node: ast.FunctionDef | ast.ClassDef, dropped: Collection[ast.expr]) -> str:
     """Return a definition with the comment above it, not indented, without the decorators that are dropped."""
+    above = comment_above(lines, first_line(node))
     first = first_line(node) - 1
     margin = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
-    while first and is_comment(lines[first - 1], first):
-        first -= 1
     gone = {number for decorator in dropped for number in range(decorator.lineno, (decorator.end_lineno or 0) + 1)}
     kept = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in gone]
-    return _dedented(kept, margin).rstrip() + "\n"
+    return "".join(f"{line}\n" for line in above) + _dedented(kept, margin).rstrip() + "\n"
 
 
 def renamed(text: str, old: str, new: str) -> str:
@@ -319,9 +322,14 @@ def inside_function(head: str, text: str, returned: str) -> str:
     return f"{head}\n{body}    return {returned}\n"
 
 
-def is_comment(line: str, number: int) -> bool:
-    """Whether a line is a comment on what stands below; one on the encoding would change all that is written."""
-    return line.lstrip().startswith("#") and not (number <= 2 and _ABOUT_THE_FILE.match(line))
+def comment_above(lines: Sequence[str], number: int) -> list[str]:
+    """Return the lines of comment above a line, without one on the encoding, which would change all that is written."""
+    first = number - 1
+    while first and lines[first - 1].lstrip().startswith("#"):
+        if first <= 2 and _ABOUT_THE_FILE.match(lines[first - 1]):
+            break
+        first -= 1
+    return [line.strip() for line in lines[first : number - 1]]
 
 
 def _dedented(lines: list[str], margin: str) -> str:
@@ -409,20 +417,11 @@ def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDe
     node
         The lambda.
     """
-    comment = _comment(lines, node)
+    # Of the only lambda on its line.
+    above = comment_above(lines, node.lineno) if lines[node.lineno - 1].count("lambda") == 1 else []
     head = f"def {UNNAMED}({ast.unparse(node.args)}):"
     text = "\n".join([head, *laid_out(ast.unparse(node.body), 1, "return ")]) + "\n"
     found = ast.parse(text).body[0]
     if not isinstance(found, ast.FunctionDef):
         raise TypeError(type(found).__name__)
-    return comment + text, ast.increment_lineno(found, node.lineno - 1)
-
-
-def _comment(lines: list[str], node: ast.Lambda) -> str:
-    """Return the comment that stands above the line of a lambda which is on it alone."""
-    if lines[node.lineno - 1].count("lambda") > 1:
-        return ""
-    first = number = node.lineno - 1
-    while first and is_comment(lines[first - 1], first):
-        first -= 1
-    return "".join(f"{line.strip()}\n" for line in lines[first:number])
+    return "".join(f"{line}\n" for line in above) + text, ast.increment_lineno(found, node.lineno - 1)

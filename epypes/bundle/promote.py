@@ -16,12 +16,12 @@ from typing import Any, Final
 from epypes.bundle.adapters import ANSWERS, is_usual, record_answer
 from epypes.bundle.clone import clone_runner
 from epypes.bundle.determinism import learn
-from epypes.bundle.emit import PIPELINES, write_module
 from epypes.bundle.expressions import write_arrays
 from epypes.bundle.graphs import parameters_of
 from epypes.bundle.hyperparameters import store_arrays, write_stored_arrays
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
+from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.proof import prove, swap_folders
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings

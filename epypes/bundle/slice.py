@@ -12,16 +12,18 @@ import sys
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, TypeVar
 
 from epypes.bundle.definitions import Definition, annotated_names, class_definition, defaults_of, function_definition
 from epypes.bundle.expressions import Arrays, expression, is_short
-from epypes.bundle.module import Position, Remark, remark_on
 from epypes.bundle.notebook_source import (
+    Position,
+    Statement,
     cell_of,
     code_on_its_own,
+    comment_above,
     inside_function,
     names_from_outside,
     names_of,
@@ -33,7 +35,17 @@ from epypes.bundle.notebook_source import (
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable
 from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state, dotted_name
-from epypes.bundle.syntax import identifier_of, is_data, is_identifier, is_same_data, literal_source, literal_value
+from epypes.bundle.syntax import (
+    LINE,
+    UNKNOWN,
+    identifier_of,
+    is_data,
+    is_identifier,
+    is_same_data,
+    laid_out,
+    literal_source,
+    literal_value,
+)
 from epypes.run.guard import WATCH, is_plain_array
 
 T = TypeVar("T")
@@ -73,9 +85,7 @@ class Slice:
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
-        Source of values, by name.
-    remarks
-        What the notebook says about constants, by name.
+        Values, by name.
     definitions
         Text of functions, classes and closures, by name.
     positions
@@ -93,8 +103,7 @@ class Slice:
         self.read: dict[str, object] = {}
         self.captured: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
-        self.constants: dict[str, str] = {}
-        self.remarks: dict[str, Remark] = {}
+        self.constants: dict[str, Constant] = {}
         self.definitions: dict[str, str] = {}
         self.positions: dict[str, Position] = {}
         self.reads: dict[str, frozenset[str]] = {}
@@ -383,18 +392,88 @@ class Slice:
             self._import_module(dotted, dotted, what)
 
     def _add_constant(self, name: str, value: Any, source: str, found: Definition, what: str) -> None:
-        if self.constants.get(name, source) != source:
+        self.claim(name, ("constant", name), what)
+        known = self.constants.setdefault(name, constant(name, source, value, found.names, found.file))
+        if known.source != source:
             place = found.place_of(name)
             raise Refused(f"{what} uses {name!r} ({place}), which has another value elsewhere. Rename one of the two.")
-        self.add_constant(name, source, what)
-        remark = remark_on(name, value, source, found.names, found.file)
-        if remark is not None:
-            self.remarks[name] = remark
 
-    def add_constant(self, name: str, source: str, what: str) -> None:
-        """Add a constant."""
-        self.claim(name, ("constant", name), what)
-        self.constants[name] = source
+    def add_constant(self, name: str, source: str) -> str:
+        """Add a constant that the notebook has under no name; return its name, which is like this one."""
+        known = next((name for name, known in self.constants.items() if known.source == source), "")
+        if not known:
+            known = self.free_name(name)
+            self.constants[known] = Constant(source, tuple(laid_out(source, before=f"{known} = ")))
+        return known
+
+
+# -- constants -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A constant as it stands in a module.
+
+    Attributes
+    ----------
+    source
+        The expression that makes it.
+    lines
+        Its lines, with the comments of the notebook.
+    position
+        The cell and line where the notebook gave it this value; () if its text does not say.
+    """
+
+    source: str
+    lines: tuple[str, ...]
+    position: Position = ()
+
+
+def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file: str) -> Constant:
+    """Return a constant as the notebook has it where it last gave the name this value, with its comments.
+
+    Parameters
+    ----------
+    name, source, value
+        The constant, and the expression that makes it again.
+    names
+        The notebook's names.
+    file
+        The file of a function that reads it.
+    """
+    plain = laid_out(source, before=f"{name} = ")
+    for statement in statements_of(name, names, file):
+        node, given = statement.node, getattr(statement.node, "value", None)
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        is_alone = len(targets) == 1 and isinstance(targets[0], ast.Name) and not isinstance(node, ast.AugAssign)
+        written = literal_value(given) if is_alone and given is not None else UNKNOWN
+        if given is None or (written is not UNKNOWN and not is_same_data(written, value)):
+            continue
+        is_computed = written is UNKNOWN and (is_data(value) or is_plain_array(value))
+        lines = _with_comments(plain, statement, given, is_computed, written is not UNKNOWN) if is_alone else plain
+        return Constant(source, tuple(lines), (statement.cell, node.lineno))
+    return Constant(source, tuple(plain))
+
+
+def _with_comments(
+    plain: list[str], statement: Statement, given: ast.expr, is_computed: bool, is_literal: bool
+) -> list[str]:
+    """Return the lines of a constant as the notebook has them if they are a literal; else with how it was computed."""
+    node, lines = statement.node, statement.lines
+    above = comment_above(lines, node.lineno)
+    beside = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+    beside = beside if beside.startswith("#") else ""
+    text = ast.get_source_segment("\n".join(lines), node) if isinstance(node, ast.Assign) and is_literal else ""
+    own = text.split("\n") if text else plain
+    computed = f"# {ast.unparse(given)} in the notebook"
+    if is_computed and not beside and len(computed) <= LINE:
+        beside = "" if ast.unparse(ast.parse("\n".join(plain))).endswith(f"= {ast.unparse(given)}") else computed
+    if beside and (text or len(own) == 1) and len(f"{own[-1]}  {beside}") <= LINE:
+        return [*above, *own[:-1], f"{own[-1]}  {beside}"]
+    return [*above, *([beside] if beside else []), *own]
+
+
+# -- meanings and values ----------------------------------------------------------------------------------------------
 
 
 def _of_object(value: object) -> Meaning:

@@ -16,7 +16,6 @@ from epypes.bundle.slice import Slice, gather
 from epypes.bundle.syntax import (
     LINE,
     Item,
-    identifier_of,
     identifiers_of,
     is_identifier,
     laid_out,
@@ -450,8 +449,4 @@ def _default(gathered: Slice, what: str, token: str, value: Any) -> str:
     source = expression_or_none(gathered, value, what, _NO_VALUE)
     if literal_source(value) or source.replace(".", "").isidentifier():
         return source
-    name = next((name for name, known in gathered.constants.items() if known == source), "")
-    if not name:
-        name = identifier_of(token.upper(), gathered.is_taken)
-        gathered.add_constant(name, source, what)
-    return name
+    return gathered.add_constant(token.upper(), source)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import epypes as ep
-from epypes.bundle.emit import emit_module
 from epypes.bundle.equivalence import refusal
 from epypes.bundle.graphs import Graphs
+from epypes.bundle.module import emit_module
 from epypes.bundle.settings import Settings
 from epypes.bundle.slice import gather
 

@@ -8,7 +8,7 @@ import types
 import pytest
 
 import epypes as ep
-from epypes.bundle.emit import emit_module
+from epypes.bundle.module import emit_module
 from epypes.bundle.settings import Settings
 from tests.bundle.cells import cell
 from tests.bundle.slicing import slice_graph

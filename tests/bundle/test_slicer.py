@@ -16,7 +16,7 @@ import skimage.filters
 from skimage.filters import gaussian
 
 import epypes as ep
-from epypes.bundle.emit import emit_module
+from epypes.bundle.module import emit_module
 from epypes.bundle.resolve import Importable, importable
 from epypes.bundle.settings import Settings
 from tests.bundle.slicing import slice_graph
