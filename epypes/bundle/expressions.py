@@ -11,8 +11,8 @@ import enum
 import pathlib
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+import types
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from decimal import Decimal
@@ -22,75 +22,69 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 from epypes.bundle.resolve import Importable, Refused, importable
-from epypes.bundle.syntax import identifier_of, literal_source
-from epypes.hints import Param
-from epypes.images import Image
+from epypes.bundle.syntax import UNKNOWN, identifier_of, is_same_data, literal_source
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
     from epypes.bundle.slice import Slice
 
 
-FunctionWriter = Callable[[Any], str]
 # Their objects know the call that makes them.
 _KNOW_THEIR_CALL: Final = (itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal)
 # More numbers are too many to read.
 _MOST_NUMBERS: Final = 200
+_MOST_CHARACTERS: Final = 400
 
 
-def expression(gathered: Slice, value: Any, what: str, function: FunctionWriter | None = None) -> str:
-    """Return the expression of a value, with what it needs imported; "" if there is none.
+def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
+    """Return the expression of a value, with what it needs imported and defined; "" if there is none.
 
     Parameters
     ----------
     gathered
         The module that it is for; is added to.
     value
-        A literal, a small array, a number of NumPy's, a member of an enumeration, something that can be imported, a
-        simple object such as a range or an itemgetter, or a tuple, list or dict of these.
+        A literal, a small array, a number of NumPy's, a member of an enumeration, a function or class, a simple object
+        such as a range or an itemgetter, or a tuple, list or dict of these.
     what
         How to call it in a reason.
-    function
-        Returns the expression of a function of the notebook; without, there is none.
+    wanted
+        The name of a function that has none of its own.
 
     Raises
     ------
     Refused
-        There would be one, but a name that it needs means something else in the module.
+        There would be one, but what it needs can't be promoted, or has a name that means something else in the module.
     """
     try:
-        return _Writer(gathered, what, function).write(value)
+        return _Writer(gathered, what, wanted).write(value)
     except RecursionError:  # it holds itself, or is nested deeper than Python reads
         return ""
 
 
-def expression_or_none(gathered: Slice, value: Any, what: str, reason: str) -> str:
+def expression_or_none(gathered: Slice, value: Any, what: str, reason: str = "", wanted: str = "") -> str:
     """Return the expression of a value; "None", with a reason noted in the slice, if there is none.
 
     ``reason`` is what stands behind ``what`` then; ``{kind}`` in it is the type of the value.
     """
-    with noted_refusals(gathered):
-        source = expression(gathered, value, what)
+    with gathered.noted_refusals():
+        source = expression(gathered, value, what, wanted)
         if not source:
             raise Refused(f"{what} {reason.replace('{kind}', type(value).__name__)}")
         return source
     return "None"
 
 
-@contextmanager
-def noted_refusals(gathered: Slice) -> Iterator[None]:
-    """Note in a slice what is refused inside, and go on after it."""
-    try:
-        yield
-    except Refused as refusal:
-        gathered.refusals.append(str(refusal))
+def is_short(source: str) -> bool:
+    """Whether an expression is one that people still read; arrays in it are short enough by themselves."""
+    return len(_ARRAY.sub("", source)) <= _MOST_CHARACTERS
 
 
 @dataclass(frozen=True, slots=True)
 class _Writer:
     gathered: Slice
     what: str
-    function: FunctionWriter | None
+    wanted: str
 
     def write(self, value: Any) -> str:
         source = literal_source(value)
@@ -106,7 +100,11 @@ class _Writer:
         if isinstance(value, re.Pattern):
             return self._pattern(value)
         made_by, arguments = _call_of(value)
-        return self._call(made_by, arguments) if made_by is not None else self._object(value)
+        if made_by is not None:
+            return self._call(made_by, arguments)
+        if is_plain_array(value):
+            return self._array(value)
+        return self._record(value) or self._object(value)
 
     def _joined(self, values: Iterable[Any]) -> str:
         """Return the expressions of values; "" unless all have one."""
@@ -127,16 +125,20 @@ class _Writer:
         return f"{module}.compile({', '.join(filter(None, (literal_source(value.pattern), named)))})"
 
     def _object(self, value: Any) -> str:
+        """Return the expression of what has a name, or a definition in the notebook; "" for any other."""
         gathered, what = self.gathered, self.what
-        if is_plain_array(value):
-            return gathered.arrays.written(gathered, value, what, self._array(value))
-        made = self._mark(value) or self._record(value)
-        if made:
-            return made
+        if isinstance(value, types.ModuleType):
+            return gathered.module_name(value.__name__, what)
+        if get_origin(value) is Annotated:
+            annotated = gathered.reference(Importable("typing", "Annotated"), what)
+            inner = self._joined((value.__origin__, *value.__metadata__))
+            return f"{annotated}[{inner}]" if inner else ""
         home = importable(value)
-        if home is None and self.function is not None and callable(value) and not isinstance(value, type):
-            return self.function(value)
-        return gathered.reference(home, what) if home else ""
+        if home is not None:
+            return gathered.reference(home, what)
+        if isinstance(value, type):
+            return gathered.add_class(value, what)
+        return gathered.add_function(value, what, self.wanted) if callable(value) else ""
 
     def _record(self, value: Any) -> str:
         """Return the expression of a member of an enumeration, a dataclass's object or a named tuple; "" for others.
@@ -146,19 +148,33 @@ class _Writer:
         kind, what = type(value), f"Class {type(value).__name__!r} of {self.what[0].lower()}{self.what[1:]}"
         if isinstance(value, enum.Enum):
             is_member = value.name in kind.__members__
-            return f"{self.gathered.add_class(kind, None, what)}.{value.name}" if is_member else ""
+            return f"{self.gathered.add_class(kind, what)}.{value.name}" if is_member else ""
         if dataclasses.is_dataclass(kind):
-            names = [field.name for field in dataclasses.fields(kind) if field.init]
-            is_record = len(names) == len(dataclasses.fields(kind))
+            names = [field.name for field in dataclasses.fields(kind)]
+            is_record = all(field.init for field in dataclasses.fields(kind))
+            defaults = {field.name: field.default for field in dataclasses.fields(kind)}
         else:
             names, is_record = [*getattr(kind, "_fields", ())], isinstance(value, tuple) and hasattr(kind, "_fields")
-        parts = [(name, expression(self.gathered, getattr(value, name), self.what)) for name in names if is_record]
-        if not is_record or not all(source for _, source in parts):
+            defaults = getattr(kind, "_field_defaults", {})
+        if not is_record:
             return ""
-        given = ", ".join(f"{name}={source}" for name, source in parts)
-        return f"{self.gathered.add_class(kind, None, what)}({given})"
+        parts = {name: getattr(value, name) for name in names}
+        given = {
+            name: self.write(part)
+            for name, part in parts.items()
+            if not is_same_data(part, defaults.get(name, UNKNOWN))
+        }
+        arguments = ", ".join(f"{name}={source}" for name, source in given.items())
+        return f"{self.gathered.add_class(kind, what)}({arguments})" if all(given.values()) else ""
 
     def _array(self, array: Any) -> str:
+        """Return the expression of an array: its numbers if they are few, else the call that reads it from a file."""
+        text = self._numbers(array)
+        if (text and len(text) <= _MOST_CHARACTERS) or not self.gathered.arrays.are_kept:
+            return text
+        return self.gathered.arrays.add(self.gathered, array, self.what) if array.dtype.kind in "biufc" else ""
+
+    def _numbers(self, array: Any) -> str:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
         import numpy as np
 
@@ -174,24 +190,6 @@ class _Writer:
             )
         order = "" if array.flags.c_contiguous else ', order="F"'
         return f'{self.gathered.module_name("numpy", self.what)}.array({listed}, dtype="{array.dtype}"{order})'
-
-    def _mark(self, value: Any) -> str:
-        """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
-        gathered, what = self.gathered, self.what
-        if isinstance(value, Image | Param):
-            given = [(field.name, getattr(value, field.name), field.default) for field in dataclasses.fields(value)]
-            sources = [(name, literal_source(setting)) for name, setting, default in given if setting != default]
-            if not all(source for _, source in sources):
-                return ""
-            listed = ", ".join(f"{name}={source}" for name, source in sources)
-            return f"{gathered.module_name('epypes', what)}.{type(value).__name__}({listed})"
-        home = importable(value.__origin__) if get_origin(value) is Annotated else None
-        marks = [self._mark(mark) for mark in value.__metadata__] if home else [""]
-        if home is None or not all(marks):
-            return ""
-        is_builtin = home.module == "builtins"
-        kind = home.qualname if is_builtin else f"{gathered.module_name(home.module, what)}.{home.qualname}"
-        return f"{gathered.reference(Importable('typing', 'Annotated'), what)}[{', '.join([kind, *marks])}]"
 
 
 def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -226,8 +224,7 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
 ARRAYS: Final = "arrays"
 READER: Final = "stored_array"
 MOST_BYTES: Final = 16_000_000
-_MOST_CHARACTERS: Final = 400
-_REFERENCE: Final = re.compile(rf'\b{READER}\("\w+"\)')
+_ARRAY: Final = re.compile(rf'\b{READER}\("\w+"\)|array\([^"]*, dtype="\S+?"')
 _TEXT: Final = '''def {reader}(name):
     """Return an array that this bundle keeps as a file; it can't be written to."""
     array = {numpy}.load({pathlib}.Path(__file__).with_name("{folder}") / f"{{name}}.npy", allow_pickle=False)
@@ -246,29 +243,7 @@ class Arrays:
 
     def __init__(self, are_kept: bool) -> None:
         self.by_name: dict[str, Any] = {}
-        self._are_kept = are_kept
-        self._even_small = False
-
-    def short(self, write: Callable[[], str]) -> str:
-        """Return the expression that ``write`` writes; "" if there is none that people still read.
-
-        Small arrays stand in it as text, unless they make it too long.
-        """
-        source = write()
-        if self._are_kept and len(source) > _MOST_CHARACTERS:
-            self._even_small = True
-            try:
-                source = write()
-            finally:
-                self._even_small = False
-        return source if len(_REFERENCE.sub("", source)) <= _MOST_CHARACTERS else ""
-
-    def written(self, gathered: Slice, array: Any, what: str, text: str) -> str:
-        """Return the expression of an array of numbers: its text, or the call that reads it from a file."""
-        is_readable = bool(text) and len(text) <= _MOST_CHARACTERS and not self._even_small
-        if not self._are_kept or is_readable or array.dtype.kind not in "biufc":
-            return text
-        return f'{READER}("{self._add(gathered, array, what)}")'
+        self.are_kept = are_kept
 
     def reader(self, gathered: Slice) -> str:
         """Return the function that reads the arrays; "" if there are none."""
@@ -277,10 +252,11 @@ class Arrays:
         numpy, pathlib = (gathered.module_name(module, READER) for module in ("numpy", "pathlib"))
         return _TEXT.format(reader=READER, numpy=numpy, pathlib=pathlib, folder=ARRAYS)
 
-    def _add(self, gathered: Slice, array: Any, what: str) -> str:
+    def add(self, gathered: Slice, array: Any, what: str) -> str:
+        """Keep an array of numbers as a file; return the call that reads it."""
         known = next((name for name, other in self.by_name.items() if other is array), "")
         if known:
-            return known
+            return f'{READER}("{known}")'
         size = sum(other.nbytes for other in self.by_name.values()) + array.nbytes
         if size > MOST_BYTES:
             raise Refused(
@@ -289,13 +265,13 @@ class Arrays:
                 "read it with importlib.resources."
             )
         if not self.by_name:
-            gathered.keep_name(READER)
-        name = identifier_of(_name_in(gathered.names.read, array), self.by_name.__contains__)
+            gathered.reserve(READER)
+        name = identifier_of(_name_in({**gathered.captured, **gathered.read}, array), self.by_name.__contains__)
         self.by_name[name] = array
         # What the function that reads them needs is known before the imports are written.
         for module in ("numpy", "pathlib"):
             gathered.module_name(module, what)
-        return name
+        return f'{READER}("{name}")'
 
 
 def write_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:

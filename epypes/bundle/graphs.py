@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import dis
+import inspect
+import types
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
-from epypes.bundle.expressions import expression_or_none, noted_refusals
-from epypes.bundle.instances import arguments_of, by_position
-from epypes.bundle.slice import Slice, slice_functions
-from epypes.bundle.syntax import Item, identifier_of, laid_out, one_per_line, quoted
+from epypes.bundle.definitions import functions_of
+from epypes.bundle.expressions import expression_or_none
+from epypes.bundle.notebook_source import nested_codes
+from epypes.bundle.resolve import Refused
+from epypes.bundle.slice import Slice
+from epypes.bundle.syntax import UNKNOWN, Item, is_same_data, laid_out, one_per_line, quoted
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written
@@ -77,84 +82,42 @@ class Graphs:
     def __init__(self, gathered: Slice) -> None:
         self.gathered = gathered
         self.blocks: list[list[str]] = []
-        self._plain: dict[int, str] = {}
         self._made: dict[int, str] = {}
-        self._arguments: dict[int, dict[str, Any]] = {}
 
-    def write(self, cg: CompGraph, more: Mapping[str, Callable[..., Any]]) -> GraphText:
-        """Write a graph; ``more`` are functions besides it, by how reasons call them. Refusals are gathered."""
-        called = [*self._callables(cg, ""), *more.items()]
-        references = slice_functions(self.gathered, called)
-        self._plain = {id(function): source for (_, function), source in zip(called, references, strict=True)}
-        return self._graph(cg, "")
-
-    def reference(self, function: Callable[..., Any]) -> str:
-        """Return the expression of a function that was given as one of ``more``."""
-        return self._plain[id(function)]
-
-    def _callables(self, cg: CompGraph, where: str) -> Iterator[tuple[str, Callable[..., Any]]]:
-        """Give the functions that have a text or a name of their own, with those inside of nodes and pipelines."""
-        for name, function in cg.functions.items():
-            what = f"Function {name!r}{where}"
-            if is_placeholder(function):
-                way_out = f"Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
-                self.gathered.refusals.append(f"{what} is a placeholder. {way_out}")
-            elif as_switch(function) is None:
-                yield from self._callables_in(_bare(function), what)
-
-    def _callables_in(self, value: Any, what: str) -> Iterator[tuple[str, Callable[..., Any]]]:
-        if isinstance(value, CompGraph):
-            yield from self._callables(value, _inside(what))
-        elif isinstance(value, Node):
-            if type(value) is not Pipeline:
-                yield f"Class {type(value).__name__!r}{_inside(what)}", type(value)
-            for part in self._arguments_of(value, what).values():
-                if isinstance(part, CompGraph | Node) or callable(part):
-                    yield from self._callables_in(_bare(part), what)
-        else:
-            yield what, value
-
-    def _arguments_of(self, made: Node, what: str) -> dict[str, Any]:
-        if id(made) not in self._arguments:
-            self._arguments[id(made)] = {}
-            with noted_refusals(self.gathered):
-                self._arguments[id(made)] = arguments_of(made, what)
-        return self._arguments[id(made)]
-
-    def _graph(self, cg: CompGraph, where: str) -> GraphText:
+    def write(self, cg: CompGraph, where: str = "") -> GraphText:
+        """Write a graph, or that of a pipeline in it, with where it is; refusals are gathered."""
         references: dict[str, str] = {}
         switches: dict[str, str] = {}
         for name, function in cg.functions.items():
             what = f"Function {name!r}{where}"
-            found = as_switch(function)
-            if found is not None:
-                switches[name] = references[name] = self._switch(cg, name, found, what)
-            elif not is_placeholder(function):
-                references[name] = self._value(_bare(function), what, name)
+            switch = as_switch(function)
+            if switch is not None:
+                switches[name] = references[name] = self._switch(cg, name, switch, what)
+            elif is_placeholder(function):
+                way_out = f"Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
+                self.gathered.refusals.append(f"{what} is a placeholder. {way_out}")
+            else:
+                references[name] = self.value(function, what, name)
         return GraphText(references, switches)
 
-    def _value(self, value: Any, what: str, name: str) -> str:
+    def value(self, value: Any, what: str, name: str) -> str:
         """Return the expression of a function, or of an argument that makes one."""
-        if isinstance(value, Node):
-            if id(value) not in self._made:
-                self._made[id(value)] = "None"
-                with noted_refusals(self.gathered):
-                    self._made[id(value)] = self._instance(value, what, name)
-            return self._made[id(value)]
-        known = self._plain.get(id(value))
-        return known or expression_or_none(self.gathered, value, what, _NOT_MADE_AGAIN)
-
-    def _variable(self, name: str) -> str:
-        variable = identifier_of(name, self.gathered.is_taken)
-        self.gathered.keep_name(variable)
-        return variable
+        while type(value) is Node:  # it does nothing else than call its function
+            value = as_written(value.func)
+        if not isinstance(value, Node):
+            return expression_or_none(self.gathered, value, what, _NOT_MADE_AGAIN, name)
+        if id(value) not in self._made:
+            self._made[id(value)] = "None"
+            with self.gathered.noted_refusals():
+                self._made[id(value)] = self._instance(value, what, name)
+        return self._made[id(value)]
 
     def _switch(self, cg: CompGraph, name: str, switch: Switch, what: str) -> str:
         by, *tokens = cg.func_inputs(name)
         (output,) = cg.func_outputs(name)
-        keys = [self._value(key, what, name) for key in switch.branches]
+        keys = [self.value(key, what, name) for key in switch.branches]
         branches = ", ".join(f"{key}: {quoted(token)}" for key, token in zip(keys, tokens, strict=True))
-        variable = self._variable(name)
+        variable = self.gathered.free_name(name)
         arguments = f"{quoted(name)}, {{{branches}}}, by={quoted(by)}, output={quoted(output)}"
         made = f"{self._epypes(what)}.switch({arguments})"
         comment = f"# Only the branch that {_printable(by)} chooses is computed."
@@ -163,27 +126,27 @@ class Graphs:
 
     def _instance(self, made: Node, what: str, name: str) -> str:
         """Write an object of a class of nodes or pipelines; return its variable."""
-        kind, given = type(made), self._arguments_of(made, what)
+        kind, given = type(made), arguments_of(made, what)
         if kind is Pipeline:
             known = f"{self._epypes(what)}.Pipeline"
         else:
-            known = self.gathered.add_class(kind, None, f"Class {kind.__name__!r}{_inside(what)}")
-        variable = self._variable(name)
+            known = self.gathered.add_class(kind, f"Class {kind.__name__!r}{_inside(what)}")
         arguments, lines, names = list[str](), list[str](), by_position(kind)
         for parameter, value in given.items():
             if isinstance(value, CompGraph):
-                source, lines = self._inner_graph(value, what, variable)
+                source, lines = self._inner_graph(value, what, name)
             else:
-                source = self._value(_bare(value), what, f"{name}_{parameter}")
+                source = self.value(value, what, f"{name}_{parameter}")
             is_next = names[: len(arguments) + 1] == [*given][: len(arguments) + 1]
             arguments.append(source if is_next else f"{parameter}={source}")
+        variable = self.gathered.free_name(name)
         self.blocks.append([*lines, *laid_out(f"{known}({', '.join(arguments)})", before=f"{variable} = ")])
         return variable
 
-    def _inner_graph(self, cg: CompGraph, what: str, variable: str) -> tuple[str, list[str]]:
+    def _inner_graph(self, cg: CompGraph, what: str, name: str) -> tuple[str, list[str]]:
         """Return the expression of the graph of a pipeline, and the lines that it stands on."""
-        text = self._graph(cg, _inside(what))
-        functions, io = self._variable(f"{variable}_functions"), self._variable(f"{variable}_io")
+        text = self.write(cg, _inside(what))
+        functions, io = self.gathered.free_name(f"{name}_functions"), self.gathered.free_name(f"{name}_io")
         ends = f"{', '.join(cg.source_tokens) or 'nothing'} -> {', '.join(cg.sink_tokens) or 'nothing'}"
         lines = [f"# {_printable(f'A graph of its own: {ends}.')}", *text.functions(functions), *text.io(io, cg)]
         epypes = self._epypes(what)
@@ -193,7 +156,7 @@ class Graphs:
         return source, lines
 
     def _epypes(self, what: str) -> str:
-        with noted_refusals(self.gathered):
+        with self.gathered.noted_refusals():
             return self.gathered.module_name("epypes", what)
         return "epypes"
 
@@ -203,14 +166,105 @@ def _inside(what: str) -> str:
     return f" of {what[0].lower()}{what[1:]}"
 
 
-def _bare(function: Any) -> Any:
-    """Return the function of a node that does nothing else than call it; anything else as it is."""
-    while type(function) is Node:
-        function = as_written(function.func)
-    return function
-
-
 def _printable(text: str) -> str:
     """Return text as it may stand in a comment, whatever it holds."""
     shown = "".join(character if character.isprintable() else "?" for character in text)
     return shown if len(shown) <= 80 else f"{shown[:77]}..."
+
+
+# -- the arguments that a node or pipeline was made with -------------------------------------------------------------
+
+_GIVEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def arguments_of(made: Node, what: str) -> dict[str, Any]:
+    """Return the arguments that make an object again, by parameter; those that are as by default are left out.
+
+    Raises
+    ------
+    Refused
+        The object does not hold an argument.
+    """
+    found: dict[str, Any] = {}
+    for parameter in parameters_of(type(made)):
+        value = _attribute(made, parameter.name)
+        if value is UNKNOWN and parameter.default is parameter.empty:
+            way_out = f"Keep it in __init__: self.{parameter.name} = {parameter.name}."
+            raise Refused(f"{what} is made with {parameter.name!r}, which it does not keep. {way_out}")
+        if value is not UNKNOWN and value is not parameter.default and not is_same_data(value, parameter.default):
+            found[parameter.name] = value
+    return found
+
+
+def by_position(kind: type) -> list[str]:
+    """Return the arguments that may be given by position, in order."""
+    first = next(above for above in kind.__mro__ if "__init__" in vars(above))
+    _, *parameters = inspect.signature(vars(first)["__init__"]).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
+
+
+def parameters_of(kind: type) -> Iterator[inspect.Parameter]:
+    """Give the parameters of a class's __init__; of those that take any others, also those of the class above."""
+    seen: set[str] = set()
+    for above in kind.__mro__:
+        if "__init__" not in vars(above):
+            continue
+        _, *parameters = inspect.signature(vars(above)["__init__"]).parameters.values()
+        named = [parameter for parameter in parameters if parameter.kind not in _GIVEN]
+        yield from (parameter for parameter in named if parameter.name not in seen)
+        seen.update(parameter.name for parameter in named)
+        if len(named) == len(parameters):
+            return
+
+
+def _attribute(made: Node, name: str) -> Any:
+    """Return the value of an argument that an object keeps."""
+    if isinstance(made, Pipeline) and name in ("cg", "hparams", "workers"):
+        return {
+            "cg": made.source_cg,
+            "hparams": dict(made.runner.hyperparameters) or None,
+            "workers": made.runner.workers,
+        }[name]
+    for attribute in (name, f"_{name}"):
+        if attribute in vars(made):
+            return as_written(vars(made)[attribute])
+    return UNKNOWN
+
+
+# What EPypes calls of an object when it runs.
+_HOOKS: Final = ("__call__", "compute", "run", "handle", "emit", "stages", "f_in", "f_out", "on_error")
+# What the pipelines of EPypes keep of a run, or hand to each other.
+_PIPELINES: Final = frozenset({
+    "network", "runner", "source_cg", "attributes", "q_in", "q_out", "f_in", "f_out", "on_error", "failed",
+    "working_on", "_attempts", "_failed_last", "_own", "loop",
+})  # fmt: skip
+
+
+def is_set_elsewhere(made: Node, name: str) -> bool:
+    """Whether an attribute of a node is one of EPypes, or one that a run sets: what it counts or remembers."""
+    if name in {*vars(Node("node", len)), *_PIPELINES, "__wrapped__"}:
+        return True
+    is_watched = as_written(vars(made)[name]) is not vars(made)[name]
+    return is_watched or name in {*_set_by_runs(type(made), _called_by(made))}
+
+
+def _called_by(made: Node) -> list[str]:
+    """Return the names of the methods that a run calls: the hooks, and what the node was made to call."""
+    function = getattr(made, "func", None)
+    own = [function.__name__] if isinstance(function, types.MethodType) and function.__self__ is made else []
+    return [*_HOOKS, *own]
+
+
+def _set_by_runs(kind: type, called: list[str]) -> Iterator[str]:
+    """Give the attributes that a run sets by the methods of a class: what it counts or remembers."""
+    functions = {name: function for above in reversed(kind.__mro__) for name, function in functions_of(above).items()}
+    waiting, reached = [*called], set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name in reached or name not in functions or name == "__init__":
+            continue
+        reached.add(name)
+        for code in nested_codes(functions[name].__code__):
+            waiting += code.co_names
+            found = dis.get_instructions(code)
+            yield from (instruction.argval for instruction in found if instruction.opname == "STORE_ATTR")

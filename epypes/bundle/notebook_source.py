@@ -11,6 +11,7 @@ import __future__
 import ast
 import dis
 import io
+import itertools
 import linecache
 import os
 import re
@@ -24,10 +25,14 @@ from functools import lru_cache
 from itertools import takewhile
 from typing import Any, Final
 
-from epypes.bundle.syntax import LINE, laid_out
+from epypes.bundle.syntax import laid_out
 
 _CELL_MAGIC: Final = "get_ipython().run_cell_magic("
 _EXECUTING: Final = ("capture", "time", "prun")
+
+
+# The number of the cell, the line.
+Position = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,39 +150,6 @@ def names_of(value: object, names: Mapping[str, Any]) -> list[str]:
     return [name for name, known in names.items() if known is value and not name.startswith("_")]
 
 
-def place_of_object(value: object, names: Mapping[str, Any], key: str = "") -> str:
-    """Return where the notebook made an object, as far as its text says; "" if it does not.
-
-    Parameters
-    ----------
-    value
-        The object.
-    names
-        The notebook's names.
-    key
-        The name that the object has in a dict, as functions of a graph have.
-    """
-    for name in names_of(value, names):
-        for statement in statements_of(name, names):
-            return f"cell [{statement.cell}], line {statement.node.lineno}"
-    for cell, text in reversed(executed_cells(names)):
-        line = _line_of_key(text, key)
-        if line:
-            return f"cell [{cell}], line {line}"
-    return ""
-
-
-@lru_cache(maxsize=512)
-def _line_of_key(text: str, key: str) -> int:
-    """Return the last line of a cell where a dict has a key; 0 if none has."""
-    tree = parsed(text)
-    lines = [0]
-    for node in ast.walk(tree) if tree and key else ():
-        if isinstance(node, ast.Dict):
-            lines += [part.lineno for part in node.keys if isinstance(part, ast.Constant) and part.value == key]
-    return max(lines)
-
-
 LATE_ANNOTATIONS: Final = __future__.annotations.compiler_flag
 # Above a function these say something about their whole file.
 _ABOUT_THE_FILE: Final = re.compile(r"\s*#(!|.*coding[:=])")
@@ -286,14 +258,13 @@ def _bare(code: types.CodeType) -> types.CodeType:
     return code.replace(co_consts=constants, co_filename="", co_firstlineno=1, co_linetable=b"")
 
 
-def code_on_its_own(text: str, name: str = "<module>") -> types.CodeType | None:
+def code_on_its_own(text: str) -> types.CodeType | None:
     """Compile a definition that was taken out, for a module where annotations are read at once; None if that fails.
 
     Whether it means there what it means in the notebook is found out by the comparison with the module's objects.
     """
     tree = parsed(text)
-    module = compiled(tree, 0) if tree is not None else None
-    return next((code for code in nested_codes(module) if code.co_name == name), None) if module else None
+    return compiled(tree, 0) if tree is not None else None
 
 
 def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
@@ -303,13 +274,12 @@ def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
 
 def own_text(lines: list[str], node: ast.FunctionDef | ast.ClassDef, dropped: Collection[ast.expr]) -> str:
     """Return a definition with the comment above it, not indented, without the decorators that are dropped."""
+    above = comment_above(lines, first_line(node))
     first = first_line(node) - 1
     margin = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
-    while first and is_comment(lines[first - 1], first):
-        first -= 1
     gone = {number for decorator in dropped for number in range(decorator.lineno, (decorator.end_lineno or 0) + 1)}
     kept = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in gone]
-    return _dedented(kept, margin).rstrip() + "\n"
+    return "".join(f"{line}\n" for line in above) + _dedented(kept, margin).rstrip() + "\n"
 
 
 def renamed(text: str, old: str, new: str) -> str:
@@ -322,32 +292,44 @@ def renamed(text: str, old: str, new: str) -> str:
     return "".join(lines)
 
 
-def with_defaults(text: str, sources: Sequence[str]) -> str:
-    """Return a definition with other defaults: those of parameters by position, then by name; "" for one that stays."""
-    if not any(sources):
-        return text
-    node, lines = ast.parse(text).body[0], text.encode().splitlines(keepends=True)
+def with_defaults(text: str, sources: Mapping[str, str]) -> str:
+    """Return a definition with other defaults, by parameter."""
+    node = ast.parse(text).body[0] if sources else None
     if not isinstance(node, ast.FunctionDef):
-        raise TypeError(type(node).__name__)
-    starts = [sum(map(len, lines[:number])) for number in range(len(lines))]
-    defaults = [*node.args.defaults, *(default for default in node.args.kw_defaults if default is not None)]
-    whole = text.encode()
-    places = [
-        (
-            starts[one.lineno - 1] + one.col_offset,
-            starts[(one.end_lineno or one.lineno) - 1] + (one.end_col_offset or 0),
-        )
-        for one in defaults
-    ]
-    for (start, end), source in sorted(zip(places, sources, strict=True), reverse=True):
-        if source:
-            whole = whole[:start] + source.encode() + whole[end:]
+        return text
+    whole, starts = text.encode(), [0, *itertools.accumulate(map(len, text.encode().splitlines(keepends=True)))]
+    changes = [(default, sources[parameter]) for parameter, default in written_defaults(node) if parameter in sources]
+    for default, source in reversed(changes):
+        start = starts[default.lineno - 1] + default.col_offset
+        end = starts[(default.end_lineno or 0) - 1] + (default.end_col_offset or 0)
+        whole = whole[:start] + source.encode() + whole[end:]
     return whole.decode()
 
 
-def is_comment(line: str, number: int) -> bool:
-    """Whether a line is a comment on what stands below; one on the encoding would change all that is written."""
-    return line.lstrip().startswith("#") and not (number <= 2 and _ABOUT_THE_FILE.match(line))
+def written_defaults(node: ast.FunctionDef) -> list[tuple[str, ast.expr]]:
+    """Return the parameters that have a default, each with its expression, in the order of the text."""
+    by_position = [*node.args.posonlyargs, *node.args.args][::-1]
+    pairs = [(one.arg, default) for one, default in zip(by_position, node.args.defaults[::-1], strict=False)][::-1]
+    by_name = zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
+    return pairs + [(one.arg, default) for one, default in by_name if default is not None]
+
+
+def inside_function(head: str, text: str, returned: str) -> str:
+    """Return a function of this head in which a definition stands, and which returns what that defines."""
+    inside = set(_lines_in_strings(text))
+    lines = enumerate(io.StringIO(text).readlines(), 1)
+    body = "".join(line if number in inside or not line.strip() else f"    {line}" for number, line in lines)
+    return f"{head}\n{body}    return {returned}\n"
+
+
+def comment_above(lines: Sequence[str], number: int) -> list[str]:
+    """Return the lines of comment above a line, without one on the encoding, which would change all that is written."""
+    first = number - 1
+    while first and lines[first - 1].lstrip().startswith("#"):
+        if first <= 2 and _ABOUT_THE_FILE.match(lines[first - 1]):
+            break
+        first -= 1
+    return [line.strip() for line in lines[first : number - 1]]
 
 
 def _dedented(lines: list[str], margin: str) -> str:
@@ -435,33 +417,11 @@ def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDe
     node
         The lambda.
     """
-    shape = ast.parse(f"def {UNNAMED}(): pass").body[0]
-    if not isinstance(shape, ast.FunctionDef):
-        raise TypeError(type(shape).__name__)
-    vars(shape).update(args=node.args, body=[ast.copy_location(ast.Return(node.body), node.body)])
+    # Of the only lambda on its line.
+    above = comment_above(lines, node.lineno) if lines[node.lineno - 1].count("lambda") == 1 else []
     head = f"def {UNNAMED}({ast.unparse(node.args)}):"
-    text = f"{_comment(lines, node)}{head}\n{_returned(''.join(lines), node.body)}\n"
-    return text, ast.copy_location(shape, node)
-
-
-def _returned(source: str, body: ast.expr) -> str:
-    """Return a body as a statement: as it stands, if that is one line which fits."""
-    text = f"    return {ast.get_source_segment(source, body)}"
-    tree = parsed(f"def f():\n{text}\n")
-    returned = getattr(tree.body[0], "body", [])[0] if tree else None
-    value = returned.value if isinstance(returned, ast.Return) else None
-    if value is not None and "\n" not in text and len(text) <= LINE and spelled_tree(value) == spelled_tree(body):
-        return text
-    return "\n".join(laid_out(ast.unparse(body), 1, "return "))
-
-
-def _comment(lines: list[str], node: ast.Lambda) -> str:
-    """Return the comment that stands above the line of a lambda, or beside it, and is on it alone."""
-    if lines[node.lineno - 1].count("lambda") > 1:
-        return ""
-    first = number = node.lineno - 1
-    while first and is_comment(lines[first - 1], first):
-        first -= 1
-    above = "".join(f"{line.strip()}\n" for line in lines[first:number])
-    rest = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().lstrip(" ,)]}")
-    return above or (f"{rest.strip()}\n" if rest.startswith("#") else "")
+    text = "\n".join([head, *laid_out(ast.unparse(node.body), 1, "return ")]) + "\n"
+    found = ast.parse(text).body[0]
+    if not isinstance(found, ast.FunctionDef):
+        raise TypeError(type(found).__name__)
+    return "".join(f"{line}\n" for line in above) + text, ast.increment_lineno(found, node.lineno - 1)

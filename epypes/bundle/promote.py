@@ -9,26 +9,92 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from epypes.bundle.adapters import ANSWERS, record_answer
+from epypes.bundle.adapters import ANSWERS, is_usual, record_answer
 from epypes.bundle.clone import clone_runner
 from epypes.bundle.determinism import learn
-from epypes.bundle.emit import write_module
 from epypes.bundle.expressions import write_arrays
+from epypes.bundle.graphs import parameters_of
 from epypes.bundle.hyperparameters import store_arrays, write_stored_arrays
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
+from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.proof import prove, swap_folders
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
-from epypes.bundle.subject import Subject, subject_of
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
-from epypes.graph import colour_order
+from epypes.graph import CompGraph, colour_order
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
+from epypes.run.guard import as_written
+
+_NO_RUNNER: Final = (
+    "An object of class {} can't be promoted. Make a runner and run it: "
+    "runner = CompGraphRunner(cg, hparams); runner.run(...)."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """What is promoted.
+
+    Attributes
+    ----------
+    runner, cg
+        Its runner, whose last run is recorded, and the graph with the user's own functions.
+    pipeline
+        The pipeline; None if a runner is promoted.
+    ports
+        f_in and f_out, as far as they are not the usual ones of a bundle.
+    attributes
+        Those of the pipeline.
+    """
+
+    runner: CompGraphRunner
+    cg: CompGraph
+    pipeline: Pipeline | None = None
+    ports: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def classes(self) -> Mapping[str, type]:
+        """The class of the pipeline by how reasons call it, if it is not one of EPypes."""
+        kind = type(self.pipeline)
+        if self.pipeline is None or kind in PIPELINES:
+            return {}
+        return {f"Class {kind.__name__!r} of pipeline {self.pipeline.name!r}": kind}
+
+
+def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:
+    """Return what is promoted.
+
+    Raises
+    ------
+    Refused
+        It is neither a runner nor a pipeline, or a port is no function.
+    """
+    for name, function in (("f_in", f_in), ("f_out", f_out)):
+        if function is not None and not callable(function):
+            raise Refused(f"{name} must be a function, not {type(function).__name__!r}.")
+    if isinstance(given, CompGraphRunner):
+        return Subject(given, given.cg, None, _ports({}, f_in, f_out))
+    if not isinstance(given, Pipeline):
+        raise Refused(_NO_RUNNER.format(type(given).__name__))
+    own = {name: getattr(given, name, None) for name in ("f_in", "f_out") if _is_port(given, name)}
+    return Subject(given.runner, given.source_cg, given, _ports(own, f_in, f_out), dict(given.attributes))
+
+
+def _ports(own: Mapping[str, Any], f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]]:
+    found = {**own, **{name: port for name, port in (("f_in", f_in), ("f_out", f_out)) if port is not None}}
+    return {name: as_written(port) for name, port in found.items() if port is not None and not is_usual(port)}
+
+
+def _is_port(pipeline: Pipeline, name: str) -> bool:
+    """Whether a pipeline was given a port, which its class may also make itself."""
+    return any(parameter.name == name for parameter in parameters_of(type(pipeline)))
 
 
 def _ignore(text: str) -> None:

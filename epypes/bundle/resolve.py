@@ -10,7 +10,6 @@ import sys
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 
@@ -62,14 +61,13 @@ def _reach(module: str, qualname: str) -> Any:
 
 
 def _public_module(module: str, qualname: str, value: Any) -> str:
-    """Return the shortest public module that shows an object whose own module is private (``skimage._shared``)."""
+    """Return the package if it shows the object, else its own module; of a private one, the shortest that shows it."""
+    # _functools is what functools is made of.
+    top = module.partition(".")[0].lstrip("_")
+    if _reach(top, qualname) is value:
+        return top
     if "._" not in module and not module.startswith("_"):
         return module
-    if (
-        module.startswith("_") and _reach(module.lstrip("_"), qualname) is value
-    ):  # _functools is what functools is made of
-        return module.lstrip("_")
-    top = module.partition(".")[0]
     shown = (name for name in list(sys.modules) if name.partition(".")[0] == top and "._" not in name)
     homes = [name for name in shown if not name.startswith("_") and _reach(name, qualname) is value]
     return min(homes, key=_plainness, default=module)
@@ -94,24 +92,6 @@ def evaluated(expression: ast.expr, names: Mapping[str, Any]) -> Any:
     if isinstance(expression, ast.Attribute):
         return getattr(evaluated(expression.value, names), expression.attr, None)
     return None
-
-
-def is_function(value: Any) -> bool:
-    """Whether a value is a function, or made of functions: a partial, a method, what a decorator has wrapped."""
-    kinds = (types.FunctionType, types.MethodType, types.BuiltinMethodType, types.MethodDescriptorType, partial)
-    return isinstance(value, kinds) or len(layers(value)) > 1
-
-
-def holds_functions(value: Any) -> bool:
-    """Whether there are functions of the notebook in tuples, lists and dicts."""
-    return any(is_function(leaf) and importable(leaf) is None for leaf in _leaves(value, 5))
-
-
-def _leaves(value: Any, depth: int) -> list[Any]:
-    if depth and type(value) in (tuple, list, dict):
-        parts = value.values() if isinstance(value, dict) else value
-        return [leaf for part in parts for leaf in _leaves(part, depth - 1)]
-    return [value]
 
 
 # A wrapper may be made to wrap itself; a hundred layers are no accident of a notebook.

@@ -1,4 +1,4 @@
-"""The slice of a notebook that some of its functions need to stand in a module of their own.
+"""The slice of a notebook that some of its objects need to stand in a module of their own.
 
 Imports, constants, classes and other functions of the notebook are followed; everything else is refused by name.
 """
@@ -7,33 +7,37 @@ from __future__ import annotations
 
 import ast
 import builtins
-import dataclasses
-import enum
+import importlib
 import sys
 import types
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
-from epypes.bundle.classes import class_definition, class_names
-from epypes.bundle.definitions import (
-    Definition,
-    FactoryCall,
-    default_values,
-    defaults_in,
-    factory_call,
-    found_definition,
-    global_names,
-    method_of,
-    only_in_annotations,
-    submodules,
+from epypes.bundle.definitions import Definition, annotated_names, class_definition, defaults_of, function_definition
+from epypes.bundle.expressions import Arrays, expression, is_short
+from epypes.bundle.notebook_source import (
+    Position,
+    Statement,
+    cell_of,
+    code_on_its_own,
+    comment_above,
+    inside_function,
+    names_from_outside,
+    names_of,
+    nested_codes,
+    renamed,
+    statements_of,
+    with_defaults,
+    written_defaults,
 )
-from epypes.bundle.expressions import Arrays, expression
-from epypes.bundle.module import AnyDefinition, Position, Positions, Remark, imported_as, remark_on
-from epypes.bundle.notebook_source import names_of, renamed, with_defaults
-from epypes.bundle.resolve import Importable, Refused, evaluated, holds_functions, importable, is_function
-from epypes.bundle.side_effects import check_asked, check_home, check_patches, check_state
+from epypes.bundle.resolve import Importable, Refused, evaluated, importable
+from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state, dotted_name
 from epypes.bundle.syntax import (
+    LINE,
+    UNKNOWN,
     identifier_of,
     is_data,
     is_identifier,
@@ -42,92 +46,26 @@ from epypes.bundle.syntax import (
     literal_source,
     literal_value,
 )
-from epypes.run.guard import WATCH
+from epypes.run.guard import WATCH, is_plain_array
 
+T = TypeVar("T")
+RESERVED: Final = frozenset({"func_dict", "func_io"})
 Meaning = tuple[str, object]
 
 
-def of_object(value: object) -> Meaning:
-    """Return the meaning of a name for an object."""
-    return "object", id(value)
+def gather(
+    write: Callable[[Slice], T], reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False
+) -> tuple[Slice, T]:
+    """Write a module's objects into a slice; return it, and what ``write`` returns.
 
-
-class Names:
-    """The names of a module.
-
-    Parameters
-    ----------
-    reserved
-        The names that the module keeps for the graph.
-
-    Attributes
-    ----------
-    read
-        What functions read by name: these names are theirs before anything is named freely.
+    It is called twice: only then is it known which names functions read, which nothing else may take.
     """
-
-    def __init__(self, reserved: Collection[str]) -> None:
-        self.reserved = reserved
-        self.read: dict[str, object] = {}
-        self._meanings: dict[str, Meaning] = {}
-
-    def claim(self, name: str, meaning: Meaning, what: str) -> None:
-        """Make a name mean one thing in the module.
-
-        Raises
-        ------
-        Refused
-            It means another.
-        """
-        if name in self.reserved:
-            raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
-        if not self.may_mean(name, meaning):
-            raise Refused(
-                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
-                "Rename one of the two."
-            )
-
-    def may_mean(self, name: str, meaning: Meaning) -> bool:
-        """Whether a name means this, or does from now on because it meant nothing."""
-        return self._meanings.setdefault(name, meaning) == meaning
-
-    def is_taken(self, name: str) -> bool:
-        """Whether a name means something in the module already."""
-        return name in self.reserved or name in self._meanings or name in self.read or hasattr(builtins, name)
-
-    def is_free(self, name: str, value: object) -> bool:
-        """Whether a name can mean an object, and hides nothing."""
-        if name in self.read:
-            return self.read[name] is value
-        if name in self.reserved or self._meanings.get(name, of_object(value)) != of_object(value):
-            return False
-        return not hasattr(builtins, name) and name not in sys.modules
-
-    def name_for(self, function: object, found: Definition, wanted: str) -> str:
-        """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
-        own, bound = "" if found.is_lambda else found.name, names_of(function, found.names)
-        is_known_otherwise = bool(found.captured) or found.names.get(own, function) is not function
-        others = [wanted, own] if is_known_otherwise else [own, wanted]
-        candidates = [*(name for name in bound if name == own), *bound, *others]
-        free = (name for name in candidates if is_identifier(name) and self.is_free(name, function))
-        return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
-
-    def alias_for(self, value: object, notebook: Mapping[str, object], own: str) -> str:
-        """Return the name that a notebook has for an object besides its own; "" if it has none that is free."""
-        known = names_of(value, notebook)
-        return "" if own in known else next((name for name in known if self.is_free(name, value)), "")
-
-
-_CONSTANT_CHARACTERS: Final = 400
-RESERVED: Final = frozenset({"func_dict", "func_io"})
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Written:
-    """What the module defines under a name: a function, or what an expression makes."""
-
-    name: str
-    text: str
+    survey = Slice(reserved, keeps_arrays=keeps_arrays)
+    write(survey)
+    gathered = Slice(reserved, keeps_arrays=keeps_arrays)
+    gathered.read.update(survey.read)
+    gathered.captured.update(survey.captured)
+    return gathered, write(gathered)
 
 
 class Slice:
@@ -139,58 +77,94 @@ class Slice:
         The names that the module keeps for the graph.
     keeps_arrays
         Whether large arrays are kept as files beside the module.
-    uncalled
-        The ids of closures that are written with what they have captured, since a call of their factory gives another.
 
     Attributes
     ----------
-    names
-        What its names mean.
+    read, captured
+        What functions read by name, and what closures have captured: the former names are theirs alone.
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
-        Source of values, by name.
-    remarks
-        What the notebook says about constants, by name.
+        Values, by name.
     definitions
-        Functions, classes, and objects made of them, by name.
+        Text of functions, classes and closures, by name.
     positions
         Where the notebook has them, as far as that is known.
     reads
-        The names that they read from outside, as far as that is known.
+        The names that they read from outside.
+    closures
+        The names of closures.
     refusals
         Why something can't be promoted.
-    called
-        The names of closures that are made by a call of their factory, by id.
     """
 
-    def __init__(
-        self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False, uncalled: Collection[int] = ()
-    ) -> None:
-        self.names = Names(reserved)
-        self.keeps_arrays, self.arrays = keeps_arrays, Arrays(keeps_arrays)
+    def __init__(self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False) -> None:
+        self.arrays = Arrays(keeps_arrays)
+        self.read: dict[str, object] = {}
+        self.captured: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
-        self.constants: dict[str, str] = {}
-        self.remarks: dict[str, Remark] = {}
-        self.definitions: dict[str, Written] = {}
-        self.refusals: list[str] = []
-        self.uncalled = frozenset(uncalled)
-        self.called: dict[int, str] = {}
-        self._known: dict[int, str] = {}
+        self.constants: dict[str, Constant] = {}
+        self.definitions: dict[str, str] = {}
         self.positions: dict[str, Position] = {}
         self.reads: dict[str, frozenset[str]] = {}
-        self._places = Positions()
+        self.closures: set[str] = set()
+        self.refusals: list[str] = []
+        self._reserved = reserved
+        self._meanings: dict[str, Meaning] = {}
+        self._known: dict[int, str] = {}
+        self._unfinished: set[int] = set()
+        self._makers: dict[tuple[str, str], str] = {}
+        self._notebook: Mapping[str, Any] = {}
 
-    def add_graph_function(self, what: str, function: Callable[..., Any], wanted: str = "") -> str:
-        """Add a function of the graph; return the expression by which the module refers to it.
-
-        ``what`` is how reasons call it, as ``"Function 'blur'"``; ``wanted`` its name if it has none of its own.
-        """
+    @contextmanager
+    def noted_refusals(self) -> Iterator[None]:
+        """Note what is refused inside, and go on after it."""
         try:
-            return self._callable(function, what, wanted)
+            yield
         except Refused as refusal:
             self.refusals.append(str(refusal))
-            return "None"
+
+    # -- names -------------------------------------------------------------------------------------------------------
+
+    def claim(self, name: str, meaning: Meaning, what: str) -> None:
+        """Make a name mean one thing in the module.
+
+        Raises
+        ------
+        Refused
+            It means another.
+        """
+        if name in self._reserved:
+            raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
+        if self._meanings.setdefault(name, meaning) != meaning:
+            raise Refused(
+                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
+                "Rename one of the two."
+            )
+
+    def is_taken(self, name: str) -> bool:
+        """Whether a name means something in the module already."""
+        return name in self._reserved or name in self._meanings or name in self.read or hasattr(builtins, name)
+
+    def reserve(self, name: str) -> None:
+        """Reserve a name that is not taken for what is written below the functions."""
+        self.claim(name, ("reserved", name), f"Function {name!r}")
+
+    def free_name(self, name: str) -> str:
+        """Reserve a name that is like this one and not taken."""
+        free = identifier_of(name, self.is_taken)
+        self.reserve(free)
+        return free
+
+    def _is_free(self, name: str, value: object) -> bool:
+        """Whether a name can mean an object, and hides nothing."""
+        if name in self.read:
+            return self.read[name] is value
+        if name in self._reserved or self._meanings.get(name, _of_object(value)) != _of_object(value):
+            return False
+        return is_identifier(name) and not hasattr(builtins, name) and name not in sys.modules
+
+    # -- imports -----------------------------------------------------------------------------------------------------
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
@@ -200,315 +174,370 @@ class Slice:
         if known:
             return min(known) + home.qualname.removeprefix(top)
         builtin = ("builtin", top)
-        if home.module == "builtins" and self.names.may_mean(top, builtin):
+        if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
             return home.qualname
         return f"{self.module_name(home.module, what)}.{home.qualname}"
 
-    def is_taken(self, name: str) -> bool:
-        """Whether a name means something in the module already."""
-        return self.names.is_taken(name)
-
-    def add_made_constant(self, name: str, source: str) -> None:
-        """Add a constant under a name that is not taken."""
-        self.names.claim(name, ("constant", name), f"Constant {name!r}")
-        self.constants[name] = source
-
-    def keep_name(self, name: str) -> None:
-        """Keep a name that is not taken for what is written below the functions."""
-        self.names.claim(name, ("kept", name), f"Function {name!r}")
-
     def module_name(self, module: str, what: str) -> str:
-        """Import a module, unless a function has brought it already under a name of its own (``np``)."""
-        aliases = [name for name, imported in self.imports if imported == module]
-        if aliases:
-            return min(aliases)
-        name = self.names.alias_for(sys.modules.get(module), self._places.notebook, module)
-        if not name:
-            self._import_module(module, what)
-            return module
-        self._import_as(module, name, what)
+        """Import a module, under the name that functions or the notebook have for it (``np``); return that name."""
+        value = importlib.import_module(module)
+        imported = [name for name, known in self.imports if known == module]
+        names = [name for name, known in self.read.items() if known is value] or names_of(value, self._notebook)
+        if not imported and module not in names:
+            imported = [name for name in names if self._is_free(name, value)]
+        name = min(imported, default=module)
+        self._import_module(module, name, what)
         return name
 
-    def _callable(self, function: Any, what: str, wanted: str) -> str:
-        """Return the expression of anything that can be called, with what it needs."""
-        home = importable(function)
-        if home is not None:
-            return self.reference(home, what)
-        if id(function) in self._known:
-            return self._known[id(function)]
-        if isinstance(function, type):
-            return self.add_class(function, None, what)
-        owner = method_of(function)
-        if owner is not None:
-            of, method = owner
-            return f"{of if isinstance(of, str) else self.reference(of, what)}.{method}"
-        if type(function) is partial and not function.__dict__.keys() - {WATCH}:
-            return self._add_partial(function, what, wanted)
-        source = "" if isinstance(function, types.FunctionType) else expression(self, function, what)
-        return source or self._add_definition(function, what, wanted).name
+    def _import_module(self, module: str, name: str, what: str) -> None:
+        if name == module:
+            self.claim(module.partition(".")[0], ("module", module.partition(".")[0]), what)
+            self.imports[module, module] = f"import {module}"
+        else:
+            self.claim(name, _of_object(sys.modules.get(module)), what)
+            self.imports[name, module] = f"import {module} as {name}"
 
-    def _add_partial(self, function: partial[Any], what: str, wanted: str) -> str:
-        """Return the expression of a partial, or the name that functions call it by."""
-        inner = f"The function of {what[0].lower()}{what[1:]}"
-        called = self._callable(function.func, inner, wanted)
-        given = [("", value) for value in function.args] + [
-            (f"{name}=", value) for name, value in function.keywords.items()
-        ]
-        parts = [called, *(name + self._argument(value, what) for name, value in given)]
-        source = f"{self.module_name('functools', what)}.partial({', '.join(parts)})"
-        names = (name for name, value in self.names.read.items() if value is function)
-        name = min(names, default="")
-        if not name:
-            return source
-        self.names.claim(name, of_object(function), what)
-        self._known[id(function)] = name
-        self._write(name, f"{name} = {source}\n", self._places.of_name(name))
-        return name
-
-    def _argument(self, value: Any, what: str) -> str:
-        """Return the expression of what a function of the notebook was given."""
-        inner = f"A function that {what[0].lower()}{what[1:]} has"
-        source = expression(self, value, what, lambda function: self._callable(function, inner, ""))
-        if not source or (len(source) > _CONSTANT_CHARACTERS and not callable(value)):
-            text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
-            raise Refused(f"{text}. Make it a token, or make it inside the function.")
-        return source
-
-    def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
-        """Add a function of the notebook."""
-        found = found_definition(function, what)
-        self._places.learn(found)
-        name = self.names.name_for(function, found, wanted)
-        self.names.claim(name, of_object(function), what)
-        self._known[id(function)] = name
-        check_state(found.function, found.node, what)
-        is_plain = function is found.function and id(function) not in self.uncalled
-        made = factory_call(found) if found.captured and is_plain else None
-        if made is not None:
-            self.called[id(function)] = name
-            self._add_made(name, made, found, what)
-            return self.definitions[name]
-        defaults = self._defaults(found, what)
-        self._add_names(name, list(global_names(found, defaults)), found, what)
-        text = with_defaults(found.text, [defaults.get(default, "") for default in defaults_in(found.node)])
-        self._write(name, renamed(text, found.name, name), self._places.of_definition(found))
-        return self.definitions[name]
-
-    def _defaults(self, found: Definition, what: str) -> dict[ast.expr, str]:
-        """Return the defaults whose text makes another value than the function has, with an expression that does."""
-        return {
-            default: self._default(parameter, default, value, found, what)
-            for parameter, default, value in default_values(found.node, found.function)
-            if not _is_kept(parameter, default, value, found)
-        }
-
-    def _default(self, parameter: str, default: ast.expr, value: Any, found: Definition, what: str) -> str:
-        text = f"{what} has the default {ast.unparse(default)!r} ({found.place_in(default)})"
-        if isinstance(default, ast.List | ast.Dict | ast.Set):
-            raise Refused(f"{text}, which has another value by now. Copy it in the function, and define that again.")
-        owner = evaluated(default.value, found.names) if isinstance(default, ast.Attribute) else None
-        if isinstance(owner, types.ModuleType) and not _is_constant(value):
-            raise Refused(f"{text}, which is no literal and no constant of a module. Write the value itself.")
-        inner = f"Its default of {parameter!r}"
-        source = expression(self, value, what, lambda function: self._callable(function, inner, ""))
-        if not source or len(source) > _CONSTANT_CHARACTERS:
+    def _import_from(self, home: Importable, name: str) -> None:
+        check_home(home, f"A function that uses {name!r}")
+        if "." in home.qualname:  # a nested name can't be imported by itself
             raise Refused(
-                f"{text}, which no short expression makes again. Make it a token, or make it in the function."
+                f"{name!r} is {home.module}.{home.qualname}, a name inside a class. Use it through the class."
             )
-        return source
+        alias = "" if name == home.qualname else f" as {name}"
+        self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
 
-    def _add_names(self, name: str, names: Sequence[str], found: AnyDefinition, what: str) -> None:
-        """Add what a definition has from outside."""
-        check_patches(found, what)
-        self.reads[name] = frozenset(names)
-        for needed in names:
-            try:
-                self._add_name(needed, found, what)
-            except Refused as refusal:
-                self.refusals.append(str(refusal))
+    # -- functions and classes ---------------------------------------------------------------------------------------
 
-    def add_class(self, kind: type, around: Mapping[str, Any] | None, what: str) -> str:
-        """Add a class, which reads the names ``around`` it if it is the notebook's; return its expression."""
+    def add_class(self, kind: type, what: str) -> str:
+        """Add a class; return its expression."""
         home = importable(kind)
         if home is not None:
             return self.reference(home, what)
-        found = class_definition(kind, self._places.names_with(kind) if around is None else around, what)
-        self.names.claim(found.name, of_object(kind), what)
         if id(kind) not in self._known:
+            is_known = self._notebook.get(kind.__name__) is kind
+            found = class_definition(kind, self._notebook if is_known else vars(sys.modules["__main__"]), what)
+            self.claim(found.name, _of_object(kind), what)
             self._known[id(kind)] = found.name
-            self._places.learn(found)
-            self._add_names(found.name, list(class_names(found)), found, what)
-            self._write(found.name, found.text, self._places.of_definition(found))
-        return found.name
+            self._write(found.name, found.text, found, what, {found.name})
+        return self._known[id(kind)]
 
-    def _add_made(self, name: str, made: FactoryCall, found: Definition, what: str) -> None:
-        """Add a closure as a call of the function that made it."""
-        arguments = [self._argument(value, what) for value in made.positional]
-        arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
-        inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]}".rstrip(",") + ","
-        factory = self._callable(made.factory, inner, "")
-        position = self._places.of_name(name) or self._places.of_definition(found)
-        self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
+    def add_function(self, function: Any, what: str, wanted: str = "") -> str:
+        """Add what can be called and is the notebook's; return its expression.
 
-    def _write(self, name: str, text: str, position: Position) -> None:
-        self.definitions[name] = Written(name, text)
-        if position:
-            self.positions[name] = position
+        ``what`` is how reasons call it, as ``"Function 'blur'"``; ``wanted`` its name if it has none of its own.
+        """
+        if id(function) in self._known:
+            return self._known[id(function)]
+        name, owner = getattr(function, "__name__", ""), _owner_of(function)
+        if owner is not _NOT_A_METHOD:
+            source = self.reference(home, what) if (home := importable(owner)) else literal_source(owner)
+            return f"{f'({source})' if source[0].isdecimal() or source[0] == '-' else source}.{name}"
+        if type(function) is partial and not function.__dict__.keys() - {WATCH}:
+            inner = f"The function of {what[0].lower()}{what[1:]}"
+            parts = [expression(self, function.func, inner, wanted)]
+            parts += [self._argument(value, what) for value in function.args]
+            parts += [f"{word}={self._argument(value, what)}" for word, value in function.keywords.items()]
+            return f"{self.module_name('functools', what)}.partial({', '.join(parts)})"
+        return self._add_definition(function, what, wanted)
 
-    def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
-        """Add what one global name of a function means at the time of promotion."""
-        names = found.names
-        value = names.get(name)
+    def _add_definition(self, function: Any, what: str, wanted: str) -> str:
+        """Add a function that has a text; return its name."""
+        found = function_definition(function, what)
+        self._notebook = self._notebook or found.names
+        name = self._name_for(function, found, wanted)
+        self.claim(name, _of_object(function), what)
+        self._known[id(function)] = name
+        self._unfinished.add(id(function))
+        if found.function is not None:
+            check_state(found.function, found.node, what)
+        changed = self._changed_defaults(found, what)
+        text = with_defaults(found.text, changed)
+        code = code_on_its_own(with_defaults(found.text, dict.fromkeys(changed, "None")))
+        found = replace(found, code=code or found.code)
+        own = next((each for each, value in found.captured.items() if value is function), "")
+        given = {
+            each: self._argument(value, what, each)
+            for each, value in found.captured.items()
+            if each != own and id(value) not in self._unfinished  # closures that need each other do so by a global name
+        }
+        if given or own not in ("", name):
+            inner = own or found.name
+            self._write_closure(name, renamed(text, found.name, inner), inner, given, found, what)
+        else:
+            self._write(name, renamed(text, found.name, name), found, what)
+        self._unfinished.discard(id(function))
+        return name
+
+    def _write_closure(
+        self, name: str, text: str, inner: str, given: Mapping[str, str], found: Definition, what: str
+    ) -> None:
+        """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
+        whole = inside_function(f"({', '.join(given)}):", text, inner)
+        around = found.function.__code__.co_qualname.split(".<locals>.")[-2] if found.function else name
+        key = (around, whole)
+        if key not in self._makers:
+            self._makers[key] = factory = identifier_of(around, self.is_taken)
+            self.claim(factory, ("closure", whole), what)
+            self._write(factory, f"def {factory}{whole}", found, what, {*given, inner})
+        arguments = ", ".join(f"{each}={source}" for each, source in given.items())
+        self.definitions[name] = f"{name} = {self._makers[key]}({arguments})\n"
+        self.closures.add(name)
+        statement = next(statements_of(name, found.names, found.file), None)
+        self.positions[name] = (statement.cell, statement.node.lineno) if statement else _position(found)
+
+    def _name_for(self, function: object, found: Definition, wanted: str) -> str:
+        """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
+        own = "" if found.is_lambda else found.name
+        others = [wanted, own]
+        if found.names.get(own) is function and not found.captured:
+            others.reverse()
+        bound = names_of(function, found.names)
+        candidates = [*(name for name in bound if name == own), *bound, *others]
+        free = (name for name in candidates if name and self._is_free(name, function))
+        return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
+
+    def _changed_defaults(self, found: Definition, what: str) -> dict[str, str]:
+        """Return expressions of the defaults whose text makes another value than the function has, by parameter."""
+        if not isinstance(found.node, ast.FunctionDef) or found.function is None:
+            return {}
+        known, changed = defaults_of(found.function), dict[str, str]()
+        for parameter, default in written_defaults(found.node):
+            if parameter not in known or _makes(default, known[parameter], found.names):
+                continue
+            changed[parameter] = source = expression(self, known[parameter], f"Its default of {parameter!r}")
+            if not source or not is_short(source):
+                text = f"{what} has the default {ast.unparse(default)!r} ({found.place_in(default)})"
+                way_out = _way_out(known[parameter], "it")
+                raise Refused(f"{text}, which no short expression makes again. {way_out}.")
+        return changed
+
+    def _argument(self, value: Any, what: str, name: str = "") -> str:
+        """Return the expression of what a partial was given, or what a closure has captured."""
+        if name:
+            self.captured[name] = value
+        inner = f"A function that {what[0].lower()}{what[1:]} has" if callable(value) else what
+        source = expression(self, value, inner, name)
+        if not source or not (is_short(source) or callable(value)):
+            text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
+            raise Refused(f"{text}. {_way_out(value, 'it')}.")
+        return source
+
+    def _write(self, name: str, text: str, found: Definition, what: str, own: Collection[str] = ()) -> None:
+        """Write a definition, after what it reads from outside; ``own`` are the names that are its own."""
+        self._notebook = self._notebook or found.names
+        check_patches(found, what)
+        read = dict.fromkeys(each for code in nested_codes(found.code) for each in names_from_outside(code))
+        self.reads[name] = frozenset(read.keys() - set(own))
+        for needed in read:
+            if needed not in own:
+                with self.noted_refusals():
+                    self._add_name(needed, found, what)
+        self.definitions[name] = text
+        self.positions[name] = _position(found)
+
+    # -- what definitions read by name -------------------------------------------------------------------------------
+
+    def _add_name(self, name: str, found: Definition, what: str) -> None:
+        """Add what one global name of a definition means at the time of promotion."""
+        value = found.names.get(name)
         check_asked(name, value, found, what)
-        if name not in names:
-            if isinstance(found, Definition) and not hasattr(builtins, name) and name in only_in_annotations(found):
-                self.imports["annotations", "__future__.annotations"] = "from __future__ import annotations"
-                return
-            if not hasattr(builtins, name):
-                place = found.place_of(name)
-                raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
-            self.names.claim(name, ("builtin", name), what)
+        if name not in found.names:
+            self._add_builtin(name, found, what)
             return
-        self.names.read[name] = value
+        self.read[name] = value
         if isinstance(value, types.ModuleType):
             self._add_module(name, value, found, what)
             return
         home = importable(value, name) if callable(value) or not is_data(value) else None
         if home is not None:
-            self.names.claim(name, of_object(value), what)
+            self.claim(name, _of_object(value), what)
             self._import_from(home, name)
-        elif is_function(value) or isinstance(value, type):
-            around = f"which {what[0].lower()}{what[1:]}"
-            if isinstance(value, type):
-                source = self.add_class(value, found.names, f"Class {value.__name__!r}, {around} uses,")
-            else:
-                source = self._callable(value, f"Function {name!r}, {around} calls,", name)
-            if source != name and name not in self.definitions:
-                self.names.claim(name, of_object(value), what)
-                self._write(name, f"{name} = {source}\n", self._places.of_name(name))
+            return
+        around = f"which {what[0].lower()}{what[1:]}"
+        if isinstance(value, type):
+            source = self.add_class(value, f"Class {value.__name__!r}, {around} uses,")
+        elif callable(value):
+            source = expression(self, value, f"Function {name!r}, {around} calls,", name)
         else:
-            self._add_constant(name, value, found, what)
+            source = expression(self, value, f"{what}, by {name!r} ({found.place_of(name)}),")
+        if not source or not (is_short(source) or callable(value)):
+            shared = _home_of_data(value)
+            if shared is None:
+                kind = f"{what} uses {name!r} from it, of type {type(value).__name__}".removeprefix(f"{what} ")
+                text = f"{what} is defined in the notebook ({found.place_of(name)}) and {kind}"
+                raise Refused(f"{text}. {_way_out(value, name)}, or move both into a module that is installed.")
+            self.claim(name, ("constant", name), what)
+            self._import_from(shared, name)
+        elif source != name:
+            self._add_constant(name, value, source, found, what)
 
-    def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
-        module, own = imported_as(name, value, found.names, found.file) if name not in found.captured else ("", "")
-        if module:
-            self.names.claim(name, ("constant", name), what)
-            self._import_from(Importable(module, own), name)
-            return
-        if self._add_table(name, value, found, what):
-            return
-        source = self._constant_source(name, value, found, what)
-        if self.constants.get(name, source) != source:
-            text = f"{what} uses {name!r} ({found.place_of(name)}), which has another value elsewhere"
-            way_out = (
-                f"Make {name} a parameter of the function around it"
-                if name in found.captured
-                else "Rename one of the two"
-            )
-            raise Refused(f"{text}. {way_out}.")
-        if name in self.constants or name in self.definitions:
-            return
-        self.names.claim(name, ("constant", name), what)
-        if name in found.captured and isinstance(found, Definition):
-            factory = found.function.__code__.co_qualname.partition(".")[0]
-            remark: Remark | None = Remark(
-                self._places.of_definition(found), beside=f"# as {factory}() had it in the notebook"
-            )
+    def _add_builtin(self, name: str, found: Definition, what: str) -> None:
+        """Add a name that is no global of the notebook."""
+        if hasattr(builtins, name):
+            self.claim(name, ("builtin", name), what)
+        elif found.has_late_annotations and name in annotated_names(found.node):
+            self.imports["annotations", "__future__.annotations"] = "from __future__ import annotations"
         else:
-            remark = remark_on(name, value, source, found.names, found.file)
-        if remark is not None:
-            self.remarks[name] = remark
-        self.constants[name] = source
+            place = found.place_of(name)
+            raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
 
-    def _add_table(self, name: str, value: Any, found: AnyDefinition, what: str) -> bool:
-        """Add a dict or sequence with functions of the notebook in it; return whether it is one."""
-        if not isinstance(value, dict | list | tuple) or not holds_functions(value):
-            return False
-        self.names.claim(name, of_object(value), what)
-        if name not in self.definitions:
-            source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
-            text = "\n".join(laid_out(source, before=f"{name} = "))
-            self._write(name, f"{text}\n", self._places.of_name(name))
-        return True
-
-    def _constant_source(self, name: str, value: Any, found: AnyDefinition, what: str) -> str:
-        called = f"{what}, by {name!r} ({found.place_of(name)}),"
-        source = self.arrays.short(lambda: expression(self, value, called))
-        if not source:
-            kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
-            raise Refused(
-                f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it, {kind}. "
-                f"Make {name} a token, make it inside the function, or move both into a module that is installed."
-            )
-        return source
-
-    def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
+    def _add_module(self, name: str, module: types.ModuleType, found: Definition, what: str) -> None:
         if module.__name__ == "__main__":
-            raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)}).")
+            text = f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)})"
+            raise Refused(f"{text}. Use what it has by its own name, without the module.")
         if name != module.__name__:
-            self._import_as(module.__name__, name, what)
+            self._import_module(module.__name__, name, what)
             return
-        for dotted in submodules(found.node, name, module) or (name,):
-            self._import_module(dotted, what)
+        for dotted in _submodules(found.node, name, module) or (name,):
+            self._import_module(dotted, dotted, what)
 
-    def _import_as(self, module: str, name: str, what: str) -> None:
-        self.names.claim(name, of_object(sys.modules.get(module)), what)
-        self.imports[name, module] = f"import {module} as {name}"
+    def _add_constant(self, name: str, value: Any, source: str, found: Definition, what: str) -> None:
+        self.claim(name, ("constant", name), what)
+        known = self.constants.setdefault(name, constant(name, source, value, found.names, found.file))
+        if known.source != source:
+            place = found.place_of(name)
+            raise Refused(f"{what} uses {name!r} ({place}), which has another value elsewhere. Rename one of the two.")
 
-    def _import_module(self, module: str, what: str) -> None:
-        top = module.partition(".")[0]
-        self.names.claim(top, ("module", top), what)
-        self.imports[module, module] = f"import {module}"
-
-    def _import_from(self, home: Importable, name: str) -> None:
-        check_home(home, f"A function that uses {name!r}")
-        top, _, rest = home.qualname.partition(".")
-        alias = "" if name == top else f" as {name}"
-        if rest:
-            # A nested name can't be imported by itself.
-            raise Refused(
-                f"{name!r} is {home.module}.{home.qualname}, a name inside a class. Use it through the class."
-            )
-        self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
+    def add_constant(self, name: str, source: str) -> str:
+        """Add a constant that the notebook has under no name; return its name, which is like this one."""
+        known = next((name for name, known in self.constants.items() if known.source == source), "")
+        if not known:
+            known = self.free_name(name)
+            self.constants[known] = Constant(source, tuple(laid_out(source, before=f"{known} = ")))
+        return known
 
 
-def _is_kept(parameter: str, default: ast.expr, value: Any, found: Definition) -> bool:
-    """Whether the text of a default makes its value: a literal, or a name or attribute that means the same by now."""
-    if isinstance(default, ast.Name | ast.Attribute):
-        # A lambda's default is often the variable of a loop.
-        is_own = isinstance(default, ast.Name) and default.id == parameter and found.is_lambda and literal_source(value)
-        is_fixed = isinstance(default, ast.Name) or _is_constant(value)
-        return is_fixed and not is_own and evaluated(default, {**vars(builtins), **found.names}) is value
+# -- constants -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A constant as it stands in a module.
+
+    Attributes
+    ----------
+    source
+        The expression that makes it.
+    lines
+        Its lines, with the comments of the notebook.
+    position
+        The cell and line where the notebook gave it this value; () if its text does not say.
+    """
+
+    source: str
+    lines: tuple[str, ...]
+    position: Position = ()
+
+
+def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file: str) -> Constant:
+    """Return a constant as the notebook has it where it last gave the name this value, with its comments.
+
+    Parameters
+    ----------
+    name, source, value
+        The constant, and the expression that makes it again.
+    names
+        The notebook's names.
+    file
+        The file of a function that reads it.
+    """
+    plain = laid_out(source, before=f"{name} = ")
+    for statement in statements_of(name, names, file):
+        node, given = statement.node, getattr(statement.node, "value", None)
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        is_alone = len(targets) == 1 and isinstance(targets[0], ast.Name) and not isinstance(node, ast.AugAssign)
+        written = literal_value(given) if is_alone and given is not None else UNKNOWN
+        if given is None or (written is not UNKNOWN and not is_same_data(written, value)):
+            continue
+        is_computed = written is UNKNOWN and (is_data(value) or is_plain_array(value))
+        lines = _with_comments(plain, statement, given, is_computed, written is not UNKNOWN) if is_alone else plain
+        return Constant(source, tuple(lines), (statement.cell, node.lineno))
+    return Constant(source, tuple(plain))
+
+
+def _with_comments(
+    plain: list[str], statement: Statement, given: ast.expr, is_computed: bool, is_literal: bool
+) -> list[str]:
+    """Return the lines of a constant as the notebook has them if they are a literal; else with how it was computed."""
+    node, lines = statement.node, statement.lines
+    above = comment_above(lines, node.lineno)
+    beside = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+    beside = beside if beside.startswith("#") else ""
+    text = ast.get_source_segment("\n".join(lines), node) if isinstance(node, ast.Assign) and is_literal else ""
+    own = text.split("\n") if text else plain
+    computed = f"# {ast.unparse(given)} in the notebook"
+    if is_computed and not beside and len(computed) <= LINE:
+        beside = "" if ast.unparse(ast.parse("\n".join(plain))).endswith(f"= {ast.unparse(given)}") else computed
+    if beside and (text or len(own) == 1) and len(f"{own[-1]}  {beside}") <= LINE:
+        return [*above, *own[:-1], f"{own[-1]}  {beside}"]
+    return [*above, *([beside] if beside else []), *own]
+
+
+# -- meanings and values ----------------------------------------------------------------------------------------------
+
+
+def _of_object(value: object) -> Meaning:
+    return "object", id(value)
+
+
+def _position(found: Definition) -> Position:
+    return cell_of(found.file, found.names), found.line
+
+
+_NOT_A_METHOD: Final = object()
+
+
+def _owner_of(function: Any) -> Any:
+    """Return what a method is of: a class that can be imported, or a literal that the method does not change."""
+    name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
+    if isinstance(function, types.MethodDescriptorType | types.WrapperDescriptorType | types.ClassMethodDescriptorType):
+        return function.__objclass__ if importable(function.__objclass__) else _NOT_A_METHOD
+    if not isinstance(function, types.MethodType | types.BuiltinMethodType) or getattr(owner, name, None) != function:
+        return _NOT_A_METHOD
+    is_class = isinstance(owner, type) and importable(owner) is not None
+    return owner if is_class or (name not in CHANGING and literal_source(owner)) else _NOT_A_METHOD
+
+
+def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
+    """Whether the text of a default makes its value: a literal, or a name that means the same by now."""
+    if isinstance(default, ast.Name) or (isinstance(default, ast.Attribute) and type(value) not in (list, dict, set)):
+        return evaluated(default, {**vars(builtins), **names}) is value
     return is_same_data(literal_value(default), value)
 
 
-def _is_constant(value: object) -> bool:
-    return (
-        callable(value)
-        or isinstance(value, enum.Enum)
-        or type(value) in (bool, int, float, complex, str, bytes, type(None))
+def _way_out(value: Any, name: str) -> str:
+    """Return what to do about a value that no expression makes again."""
+    if is_data(value) or is_plain_array(value):
+        return f"Make {name} a token, or make it inside the function"
+    return f"Make {name} inside the function, or at module level of a module that is imported"
+
+
+def _home_of_data(value: Any) -> Importable | None:
+    """Return the name under which an installed module has a container, such as a table that is too long for text."""
+    if type(value) not in (list, dict, set, tuple):
+        return None
+    modules = [(name, module) for name, module in list(sys.modules.items()) if name != "__main__" and "._" not in name]
+    found = (
+        Importable(name, known)
+        for name, module in modules
+        for known, other in list(getattr(module, "__dict__", {}).items())
+        if other is value and not name.startswith("_")
     )
+    return next(found, None)
 
 
-def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
-    """Add functions of graphs, each given with how reasons call it; return the expressions that refer to them."""
-    survey = Slice(gathered.names.reserved, keeps_arrays=gathered.keeps_arrays, uncalled=gathered.uncalled)
-    _add_all(survey, functions)
-    gathered.names.read.update(survey.names.read)
-    return _add_all(gathered, functions)
-
-
-def _add_all(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
-    homes = {id(function): importable(function) for _, function in functions}
-    # The notebook's own functions first: they know by which names they import modules.
-    own_first = sorted(range(len(functions)), key=lambda index: homes[id(functions[index][1])] is not None)
-    references: dict[int, str] = {}
-    known: dict[int, str] = {}
-    for index in own_first:
-        what, function = functions[index]
-        refused = len(gathered.refusals)
-        wanted = what.partition("'")[2].partition("'")[0]
-        references[index] = known.get(id(function)) or gathered.add_graph_function(what, function, wanted)
-        if len(gathered.refusals) == refused:
-            known[id(function)] = references[index]
-    return [references[index] for index in range(len(functions))]
+def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
+    """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
+    found: dict[str, None] = {}
+    for node in ast.walk(tree):
+        chain = dotted_name(node)
+        reached: Any = module
+        dotted = name
+        for part in chain[1:] if chain[:1] == (name,) else ():
+            reached = getattr(reached, part, None)
+            if not isinstance(reached, types.ModuleType) or reached.__name__ != f"{dotted}.{part}":
+                break
+            dotted = f"{dotted}.{part}"
+        if dotted != name:
+            found[dotted] = None
+    return tuple(found)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Final
@@ -13,11 +12,10 @@ from epypes.bundle.clone import called_by, is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import expression_or_none
 from epypes.bundle.module import module_text
-from epypes.bundle.slice import Slice, slice_functions
+from epypes.bundle.slice import Slice, gather
 from epypes.bundle.syntax import (
     LINE,
     Item,
-    identifier_of,
     identifiers_of,
     is_identifier,
     laid_out,
@@ -33,6 +31,7 @@ from epypes.run import CompGraphRunner
 # Python itself can't indent deeper than 100; half of that can't be read.
 _DEEPEST: Final = 20
 _SHOWN: Final = 40
+_NO_EXPRESSION: Final = "is of type {kind}, and no expression makes it again. Write a plain function (def)."
 _NO_VALUE: Final = (
     "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
     "numbers, strings, a small array or tuples of them."
@@ -108,39 +107,30 @@ def to_source(
     return _written(name, graph, values, wanted)
 
 
-def _written(
-    name: str,
-    cg: CompGraph,
-    values: Mapping[str, Any],
-    wanted: tuple[str, ...] | None,
-    uncalled: Collection[int] = (),
-) -> str:
-    """Return the text; closures whose ids are in ``uncalled`` are written with what they have captured."""
-    parts = _with_pipelines(_Part(name, cg, values, wanted))
-    missing = [function for part in parts for function in part.cg.placeholders if function in set(part.functions)]
-    if missing:
-        raise PlaceholderNeeded(missing)
-    gathered = Slice(reserved=(name,), uncalled=uncalled)
-    gathered.refusals += _unwritable(parts, name, wanted)
-    _slice(gathered, parts)
-    for part in parts:
-        _write_values(gathered, part)
-    if gathered.refusals and gathered.called:
-        with suppress(SourceRefused):
-            return _written(name, cg, values, wanted, {*uncalled, *gathered.called})
+def _written(name: str, cg: CompGraph, values: Mapping[str, Any], wanted: tuple[str, ...] | None) -> str:
+    def write(gathered: Slice) -> list[_Part]:
+        parts = _with_pipelines(_Part(name, cg, values, wanted))
+        missing = [function for part in parts for function in part.cg.placeholders if function in set(part.functions)]
+        if missing:
+            raise PlaceholderNeeded(missing)
+        gathered.refusals += _unwritable(parts, name, wanted)
+        _slice(gathered, parts)
+        for part in parts:
+            _write_values(gathered, part)
+        return parts
+
+    gathered, parts = gather(write, reserved=(name,))
     if gathered.refusals:
         raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
     text = module_text([], gathered, [part.text() for part in parts])
-    why, closure = _difference(text, parts, gathered)
-    if closure:
-        return _written(name, cg, values, wanted, {*uncalled, closure})
+    why = _difference(text, parts)
     if why:
         raise SourceRefused((why,))
     return text
 
 
-def _difference(text: str, parts: Sequence[_Part], gathered: Slice) -> tuple[str, int]:
-    """Return why what a module calls is not what the graph calls, as ``refusal`` returns it."""
+def _difference(text: str, parts: Sequence[_Part]) -> str:
+    """Return why what a module calls is not what the graph calls; "" if it is."""
     compared: list[tuple[str, Any, str]] = []
     for part in parts:
         for name, source in part.references.items():
@@ -153,7 +143,7 @@ def _difference(text: str, parts: Sequence[_Part], gathered: Slice) -> tuple[str
     def pairs(module: Any) -> list[Pair]:
         return [(what, ours, made) for (what, ours, _), made in zip(compared, module.references, strict=True)]
 
-    return refusal(whole, {}, pairs, gathered.called)
+    return refusal(whole, {}, pairs)[0]
 
 
 @dataclass(eq=False, slots=True)
@@ -426,17 +416,14 @@ def _unwritable(parts: Sequence[_Part], name: str, wanted: Sequence[str] | None)
 
 def _slice(gathered: Slice, parts: Sequence[_Part]) -> None:
     """Gather what the functions need, and note by which expressions they are called."""
-    called: list[tuple[_Part, str, Callable[..., Any]]] = []
     for part in parts:
-        written = [name for name in part.functions if name not in part.branches and name not in part.pipelines]
-        called += [(part, name, called_by(part.cg.functions[name])) for name in written]
-    functions = [(f"Function {name!r}{part.where}", function) for part, name, function in called]
-    for (part, name, _), reference in zip(called, slice_functions(gathered, functions), strict=True):
-        part.references[name] = reference
+        for name in part.functions:
+            if name not in part.branches and name not in part.pipelines:
+                what, function = f"Function {name!r}{part.where}", called_by(part.cg.functions[name])
+                part.references[name] = expression_or_none(gathered, function, what, _NO_EXPRESSION, name)
     for part in parts:
         if part.where:  # its name must hide nothing
-            part.name = identifier_of(part.name, gathered.is_taken)
-            gathered.keep_name(part.name)
+            part.name = gathered.free_name(part.name)
     for part in parts:
         part.references.update({name: inner.name for name, inner in part.pipelines.items()})
 
@@ -462,8 +449,4 @@ def _default(gathered: Slice, what: str, token: str, value: Any) -> str:
     source = expression_or_none(gathered, value, what, _NO_VALUE)
     if literal_source(value) or source.replace(".", "").isidentifier():
         return source
-    name = next((name for name, known in gathered.constants.items() if known == source), "")
-    if not name:
-        name = identifier_of(token.upper(), gathered.is_taken)
-        gathered.add_made_constant(name, source)
-    return name
+    return gathered.add_constant(token.upper(), source)

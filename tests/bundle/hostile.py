@@ -63,6 +63,28 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
         "    return total\ntotal = make_sum()",
         {"total": "total"},
     ),
+    "closure whose variable hides a builtin of others": (
+        "def make_bounded():\n    max = len('abc')\n    def bounded(a):\n        return a + max\n    return bounded\n"
+        "bounded = make_bounded()\ndef with_bounded(a):\n    return bounded(a) + max(1, 2)",
+        {"with_bounded": "with_bounded"},
+    ),
+    "closures that call each other": (
+        "def make_parity():\n    def is_even(n):\n        return n == 0 or is_odd(n - 1)\n    def is_odd(n):\n"
+        "        return n != 0 and is_even(n - 1)\n    return is_even\neven_size = make_parity()\n"
+        "def sized(a):\n    return even_size(a.size)",
+        {"sized": "sized"},
+    ),
+    "closure that a decorator of a library wraps": (
+        "def make_cached(k):\n    @functools.lru_cache\n    def times(n):\n        return n * k if n else times(1)\n    return times\n"
+        "by_3, by_4 = make_cached(3), make_cached(4)\ndef cached_times(a):\n    return by_3(int(a.max())) + by_4(0)",
+        {"cached_times": "cached_times"},
+    ),
+    "closure over a module, a class and an array": (
+        "class Scale:\n    by = 3\ndef make_scaled():\n    import math as m\n    kind, weights = Scale, np.arange(30.0)\n"
+        "    def scaled(a):\n        \"\"\"Scale.\n\n        All of it.\n        \"\"\"\n        return a * kind.by + weights[m.floor(2.5)]\n"
+        "    return scaled\nscaled_row = make_scaled()",
+        {"scaled_row": "scaled_row"},
+    ),
     "recursion": ("def depth(a):\n    return 0 if a.size < 2 else 1 + depth(a.ravel()[1:])", {"depth": "depth"}),
     "mutual recursion": (
         "def even(n):\n    return n == 0 or odd(n - 1)\ndef odd(n):\n    return n != 0 and even(n - 1)\n"
@@ -218,10 +240,6 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "library's decorator with a changed argument": (
         "N = 2\n@functools.lru_cache(N)\ndef f(a):\n    return a\nN = 3", "f", r"'f' \(cell \[1\], line 2\): its parameters\['maxsize'\] is 2 in the notebook and 3",
     ),
-    "local of a factory that hides a builtin of others": (
-        "def make():\n    max = np.random.rand()\n    def g(a):\n        return a + max\n    return g\ng = make()\ndef f(a):\n    return g(a) + max(1, 2)", "f",
-        r"uses the name 'max', which means something else in another function of the graph\. Rename one",
-    ),
     "value of a module that was changed": (
         "import string\nstring.digits = '0123456789'\ndef f(a):\n    return string.digits", "f",
         r"'string\.digits', which the notebook has changed \(cell \[1\], line 2\).* make the value a token",
@@ -255,7 +273,7 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "set of a class": (
         "class M:\n    seen = set()\ndef f(a):\n    M.seen.add(a.size)\n    return a", "f", r"writes into 'M', .*\(cell \[1\], line 4\)",
     ),
-    "partial of an object": ("f = functools.partial(np.add, object())", "f", r"has a value of type object inside.* Make it a token"),
+    "partial of an object": ("f = functools.partial(np.add, object())", "f", r"has a value of type object inside.* Make it inside the function"),
     "attributes": ("def f(a):\n    return a\nf.seen = 3", "f", r"'f' \(cell \[1\], line 1\): it has attribute 'seen' only in the notebook.* make it a token"),
 }  # fmt: skip
 

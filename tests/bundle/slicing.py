@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import epypes as ep
-from epypes.bundle.emit import emit_module
 from epypes.bundle.equivalence import refusal
+from epypes.bundle.graphs import Graphs
+from epypes.bundle.module import emit_module
 from epypes.bundle.settings import Settings
-from epypes.bundle.slice import Slice, slice_functions
+from epypes.bundle.slice import gather
 
 
-def slice_graph(functions, uncalled=()):
+def slice_graph(functions):
     """Return what the module needs, and by function of the graph the expression that refers to it.
 
     The module is executed and compared with the functions, as a promotion does.
     """
-    gathered = Slice(uncalled=uncalled)
-    references = slice_functions(gathered, [(f"Function {name!r}", function) for name, function in functions.items()])
-    written = dict(zip(functions, references, strict=True))
+    cg = ep.CompGraph(functions, {name: ("x", f"{name}_made") for name in functions}, types=False)
+    gathered, written = gather(lambda needed: Graphs(needed).write(cg).references)
     if not gathered.refusals:
-        cg = ep.CompGraph(functions, {name: ("x", f"{name}_made") for name in functions}, types=False)
         text = emit_module(Settings("case", ("x",), ("y",), {}), cg, gathered, written)
-        why, closure = refusal(text, {}, lambda made: _pairs(functions, made), gathered.called)
-        if closure:
-            return slice_graph(functions, {*uncalled, closure})
+        why, _ = refusal(text, {}, lambda made: _pairs(functions, made))
         gathered.refusals += [why] if why else []
     return gathered, written
 

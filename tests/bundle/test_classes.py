@@ -8,7 +8,7 @@ import types
 import pytest
 
 import epypes as ep
-from epypes.bundle.emit import emit_module
+from epypes.bundle.module import emit_module
 from epypes.bundle.settings import Settings
 from tests.bundle.cells import cell
 from tests.bundle.slicing import slice_graph
@@ -99,7 +99,7 @@ def test_a_class_is_sliced_with_what_it_needs(source):
 def test_a_class_stands_before_what_is_made_of_it():
     text, _, _ = promoted(PROMOTED["record"])
     assert text.split('"""\n', 2)[1].startswith("\nfrom dataclasses import dataclass\n\n\n@dataclass\nclass Cfg:\n")
-    assert "\n    t: tuple = (1, 2)\n\n\nCFG = Cfg(k=5, t=(1, 2))\n\n\ndef f(x):\n" in text
+    assert "\n    t: tuple = (1, 2)\n\n\nCFG = Cfg(k=5)\n\n\ndef f(x):\n" in text
 
 
 USED = "def f(x):\n    return A().g() + x\n"

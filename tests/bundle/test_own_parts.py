@@ -177,7 +177,7 @@ def test_the_module_reads_as_it_was_written(promoted):
     parts = [
         "import enum\nfrom dataclasses import dataclass\n\nimport cv2\nimport epypes as ep\nimport numpy as np\n",
         "# Weighs the channels as people see them.\ndef grayscale(im):\n",
-        "LIMITS = Limits(low=0, high=250)\n",
+        "LIMITS = Limits(high=250)\n",
         '# A graph of its own: image, k -> image_blurred.\nsmooth_functions = {\n    "gray": grayscale,\n',
         'smooth = ep.Pipeline(\n    "smooth",\n    ep.group(\n        ep.CompGraph(smooth_functions, smooth_io),',
         'sobel_ = Gain("sobel", sobel, 2.0)\n',

@@ -16,7 +16,7 @@ import skimage.filters
 from skimage.filters import gaussian
 
 import epypes as ep
-from epypes.bundle.emit import emit_module
+from epypes.bundle.module import emit_module
 from epypes.bundle.resolve import Importable, importable
 from epypes.bundle.settings import Settings
 from tests.bundle.slicing import slice_graph
@@ -95,6 +95,7 @@ SLICED = {
         "import types\nm = types.ModuleType('m')\nm.k = 1\ndef f(x, k=m.k):\n    return x + k\nm.k = 2\n",
         4,
     ),
+    "list of a module as default": ("import sys\ndef f(x, k=sys.argv):\n    return x + isinstance(k, list)\n", 4),
     "type as default": ("def f(x, kind=np.uint8):\n    return kind(x).itemsize\n", 1),
     "unguarded": ("@ep.unguarded\ndef f(x):\n    return x\n", 3),
     "redefinition": ("def f(x):\n    return 0\ndef f(x):\n    return x\n", 3),
@@ -119,7 +120,6 @@ REFUSED = {
     "array of objects": ("K = np.array([None])\ndef f(x):\n    return K\n", "uses 'K' from it, of type ndarray"),
     "array with NaN": ("K = np.array([np.nan])\ndef f(x):\n    return K\n", "uses 'K' from it, of type ndarray"),
     "big constant": ("K = list(range(1000))\ndef f(x):\n    return K[x]\n", "uses 'K' from it, of type list"),
-    "default that may change": ("import sys\ndef f(x, k=sys.path):\n    return x\n", "default 'sys.path'"),
 }
 
 
@@ -259,11 +259,10 @@ def f(im):
     body = text.split('"""')[2].partition("func_dict")[0]
     assert body.split("\n\n\n") == [
         "\n\nimport functools\n\nLOW = 0.5\nSIZE = 0x10  # of the window\nLIMIT = 3  # sum([1, 2]) in the notebook\n"
-        "STEP = 3  # the second\nWEIGHTS = (1, 2,\n           3)",
+        "STEP = 3  # the second\nWEIGHTS = (1, 2,\n           3)\noffset = functools.partial(max, 3, key=abs)",
         "def blurred(im):\n    return smooth(im) + offset(im)",
-        "# Makes filters.\ndef make_smooth(k, sigma=0):\n    def smooth(im):\n        return im * k + sigma\n    return smooth",
-        "smooth = make_smooth(5)",
-        "offset = functools.partial(max, 3, key=abs)",
+        "def make_smooth(k, sigma):\n    def smooth(im):\n        return im * k + sigma\n    return smooth",
+        "smooth = make_smooth(k=5, sigma=0)",
         'by_name = {"smooth": smooth}',
         'def f(im):\n    return by_name["smooth"](im) + blurred(im) + LOW + SIZE + LIMIT + STEP + WEIGHTS[2]',
         "",
@@ -301,14 +300,15 @@ def eval_in_cell(source: str):
     return notebook(f"made = [{source}]\n")["made"][0]
 
 
-def test_closures_over_different_values_of_one_name_are_refused_with_the_way_out():
+def test_closures_over_different_values_of_one_name_share_the_function_that_makes_them():
     cell = "def make(k):\n    k = 2 * k\n    def f(x):\n        return x + k\n    return f\na, b = make(3), make(5)\n"
     names = notebook(cell)
-    needed, _ = slice_graph({"a": names["a"], "b": names["b"]})
-    assert len(needed.refusals) == 1
-    assert re.search(
-        r"uses 'k' \(.*line 4\), which has another value elsewhere\. Make k a parameter", needed.refusals[0]
-    )
+    cg = ep.CompGraph({"a": names["a"], "b": names["b"]}, {"a": ("x", "y"), "b": ("x", "z")})
+    needed, references = slice_graph(cg.functions)
+    assert needed.refusals == []
+    text = emit_module(SETTINGS, cg, needed, references)
+    assert text.count("def make(k):") == 1
+    assert [function(1) for function in executed(text).func_dict.values()] == [7, 11]
 
 
 def test_lambdas_on_a_line_that_python_can_not_tell_apart_are_refused():

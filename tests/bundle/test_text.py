@@ -149,12 +149,11 @@ def test_a_default_that_was_changed_since_is_written_as_it_is(value):
         written(function)
 
 
-def test_a_default_that_was_filled_since_is_refused():
+def test_a_default_that_was_filled_since_is_written_as_it_is():
     function = notebook("def f(x, k=[]):\n    k.append(x)\n    return k\n")["f"]
     assert executed(written(function))(1) == [1]
     function(1)
-    with pytest.raises(SourceRefused, match=r"default '\[\]' .*another value by now"):
-        written(function)
+    assert executed(written(function))(2) == [1, 2]
 
 
 @pytest.mark.parametrize("default", [None, 2])
