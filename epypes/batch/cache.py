@@ -16,10 +16,10 @@ from time import monotonic
 from typing import Any, Final, Self
 from warnings import warn
 
-from epypes.batch.fingerprint import Digester, combined_digest, file_digest, versions_of
 from epypes.batch.items import Item
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
+from epypes.bundle.fingerprint import Digester, combined_digest, file_digest, versions_of
 from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner

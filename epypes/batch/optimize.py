@@ -22,7 +22,6 @@ from epypes.batch.cache import (
 )
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
-from epypes.batch.fingerprint import combined_digest
 from epypes.batch.items import Item, detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.progress import progress_bar
@@ -30,6 +29,7 @@ from epypes.batch.ranges import Axis, ChoiceAxis, axes_of
 from epypes.batch.results import Outcome
 from epypes.batch.search_result import OptimizeResult
 from epypes.batch.study import Direction, Search, Suggestion, Trial
+from epypes.bundle.fingerprint import combined_digest
 from epypes.errors import EpypesError, ScaleError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner

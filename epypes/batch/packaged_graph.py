@@ -20,10 +20,10 @@ from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
 from epypes.batch.cache import source_of
-from epypes.batch.fingerprint import combined_digest
 from epypes.batch.job import Job, RunnerPool, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
+from epypes.bundle.fingerprint import combined_digest
 from epypes.bundle.hyperparameters import Unwritable, members_in, read, written
 from epypes.bundle.load import SAMPLES, Bundle, read_bundle
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError

@@ -34,7 +34,7 @@ from epypes.bundle.notebook_source import (
     statements_of,
 )
 from epypes.bundle.resolve import Refused, evaluated, importable, layers
-from epypes.bundle.side_effects import captured_by, check_globals, check_nonlocal, check_state, unrepeatable
+from epypes.bundle.side_effects import captured_by, check_globals, check_nonlocal, check_state
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
 
@@ -192,14 +192,9 @@ def _is_written(decorator: ast.expr, function: types.FunctionType) -> bool:
 
 
 def _check_decorator(decorator: ast.expr, wrapper: Any, function: types.FunctionType, what: str) -> None:
-    """Refuse a decorator that keeps something from call to call, or reads what another process has otherwise."""
+    """Refuse a decorator that keeps something from call to call."""
     place = place_in(function.__code__.co_filename, decorator.lineno)
     what = f"{what} is wrapped by a decorator, @{ast.unparse(decorator)} ({place}):"
-    given = [*decorator.args, *(each.value for each in decorator.keywords)] if isinstance(decorator, ast.Call) else []
-    for argument in given:
-        if unrepeatable(ast.Expression(argument), function.__globals__) is not None:
-            text = f"{what} its argument {ast.unparse(argument)!r} may be something else in a service"
-            raise Refused(f"{text}. Compute it above under a name of its own.")
     code = wrapper.__code__ if isinstance(wrapper, types.FunctionType) and importable(wrapper) is None else None
     node = definition_of(code)[1] if code is not None else None
     if node is not None and not _is_of_library(wrapper):
@@ -217,11 +212,6 @@ def _check_decorator(decorator: ast.expr, wrapper: Any, function: types.Function
         raise Refused(
             f"{text}. Leave that to a statement below the function, and let the decorator only wrap it."
         ) from refusal
-    part = unrepeatable(factory, made_by.__globals__, code)
-    if part is not None:
-        place = place_in(made_by.__code__.co_filename, part.lineno)
-        text = f"{what} it calls {ast.unparse(part)!r} ({place}), which may give something else in a service"
-        raise Refused(f"{text}. Compute it above under a name of its own.")
 
 
 def _is_of_library(function: types.FunctionType) -> bool:
@@ -296,11 +286,6 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> Defini
         way_out = "Write a class statement for it, as class P(typing.NamedTuple), and make again what was made of it."
         raise Refused(f"{what} has no class statement: it was made by a call. {way_out}")
     names = next((function.__globals__ for function in functions_of(kind).values()), around)
-    part = unrepeatable(node, names)
-    if part is not None:
-        text = f"{what} calls {ast.unparse(part)!r} ({place_in(file, part.lineno)}) when it is defined"
-        way_out = "Compute it above the class under a name of its own, VALUE = ..., and use that name in the class"
-        raise Refused(f"{text}: that may give something else in a service. {way_out}.")
     text = own_text(lines_in(file), node, ())
     code = _compiled(text, what, place_in(file, node.lineno))
     check_globals(code, node, file, what)

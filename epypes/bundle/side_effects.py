@@ -9,7 +9,6 @@ import ast
 import builtins
 import dis
 import linecache
-import os
 import sys
 import types
 from collections import deque
@@ -18,15 +17,13 @@ from functools import lru_cache
 from typing import Any, Final
 
 from epypes.bundle.notebook_source import (
-    definition_of,
     executed_cells,
-    first_line,
     names_from_outside,
     nested_codes,
     parsed,
     place_in,
 )
-from epypes.bundle.resolve import Importable, Refused, evaluated, importable
+from epypes.bundle.resolve import Importable, Refused, evaluated
 from epypes.run.guard import is_plain_array
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
@@ -282,127 +279,3 @@ def _imports_of(tree: ast.AST) -> dict[str, Any]:
             dotted = alias.name if alias.asname else alias.name.partition(".")[0]
             found[alias.asname or dotted] = sys.modules.get(dotted)
     return found
-
-
-# -- calls when a module is imported ---------------------------------------------------------------------------------
-
-# Calls that give the same wherever and whenever they are made.
-_REPEATABLE: Final[Mapping[str, frozenset[str]]] = {
-    "builtins": frozenset((
-        "abs", "all", "any", "bool", "bytes", "chr", "complex", "dict", "divmod", "enumerate",
-        "float", "frozenset", "int", "isinstance", "issubclass", "iter", "len", "list",
-        "max", "min", "next", "object", "ord", "pow", "property", "range", "repr", "reversed", "round", "set", "slice",
-        "sorted", "str", "sum", "super", "tuple", "type", "zip",
-    )),
-    "numpy": frozenset((
-        "arange", "array", "asarray", "ascontiguousarray", "asfortranarray", "concatenate", "cumsum", "diag", "dtype",
-        "eye", "full", "hstack", "identity", "linspace", "logspace", "max", "mean", "meshgrid", "min", "ones",
-        "ones_like", "outer", "prod", "stack", "sum", "tri", "vstack", "zeros", "zeros_like",
-    )),
-    "cv2": frozenset(("getGaborKernel", "getGaussianKernel", "getRotationMatrix2D", "getStructuringElement")),
-    "pathlib": frozenset(("Path", "PurePath", "PurePosixPath")),
-    "logging": frozenset(("getLogger",)),
-}  # fmt: skip
-_REPEATABLE_MODULES: Final = frozenset((
-    "abc", "collections", "contextlib", "dataclasses", "decimal", "enum", "fractions", "functools", "itertools",
-    "math", "operator", "re", "types", "typing",
-))  # fmt: skip
-_ORDER_FREE: Final = frozenset({"all", "any", "frozenset", "len", "max", "min", "set", "sorted", "sum"})
-_REPEATABLE_METHODS: Final = frozenset((
-    "append", "astype", "copy", "extend", "format", "get", "items", "join", "keys", "lower", "max", "mean", "min",
-    "ravel", "replace", "reshape", "split", "strip", "sum", "transpose", "update", "upper", "values",
-))  # fmt: skip
-
-
-def unrepeatable(node: ast.AST, names: Mapping[str, Any], inner: types.CodeType | None = None) -> ast.expr | None:
-    """Return the first part that may give something else in another process; None if there is none.
-
-    The comparison with the notebook's objects finds what differs from call to call. What depends on the machine, such
-    as a file, a variable of the environment or an address in memory, it can't tell.
-
-    Parameters
-    ----------
-    node
-        A class, or a function that is called when the module is imported.
-    names
-        What names mean there.
-    inner
-        The code of a function inside, which that function returns and which is called later.
-    """
-    return _unrepeatable(node, names, inner, set())
-
-
-def _unrepeatable(
-    node: ast.AST, names: Mapping[str, Any], inner: types.CodeType | None, seen: set[types.CodeType]
-) -> ast.expr | None:
-    parts = [*_at_once(node, inner)]
-    own = {part.id for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
-    names = {**names, **dict.fromkeys(own), **_imports_of(node)}
-    unused = {part.value for part in parts if isinstance(part, ast.Expr)}
-    for part in parts:
-        if isinstance(part, ast.For | ast.comprehension) and _has_no_order(part.iter, names):
-            return part.iter
-        if isinstance(part, ast.Call) and not _is_repeatable(part, names, seen, part in unused):
-            return part
-        if isinstance(part, ast.Attribute | ast.Name) and evaluated(part, names) is os.environ:
-            return part
-    return None
-
-
-def _has_no_order(node: ast.expr, names: Mapping[str, Any]) -> bool:
-    """Whether this is a set, whose order changes from process to process."""
-    if isinstance(node, ast.Call):
-        return isinstance(node.func, ast.Name) and node.func.id in ("set", "frozenset")
-    return isinstance(node, ast.Set | ast.SetComp) or isinstance(evaluated(node, names), set | frozenset)
-
-
-def _at_once(node: ast.AST, inner: types.CodeType | None) -> Iterator[ast.AST]:
-    """Give what of a function or class runs when it is called or defined; of functions inside only their defaults."""
-    for part in ast.iter_child_nodes(node):
-        if isinstance(part, ast.arguments):
-            continue
-        if not isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            yield part
-            yield from _at_once(part, inner)
-            continue
-        for default in (*part.args.defaults, *part.args.kw_defaults):
-            yield from ast.walk(default) if default is not None else ()
-        if inner is not None and not _defines(part, inner) and any(_defines(each, inner) for each in ast.walk(part)):
-            yield from _at_once(part, inner)
-
-
-def _defines(node: ast.AST, code: types.CodeType) -> bool:
-    """Whether a part of the text that some code is from is its definition."""
-    if isinstance(node, ast.Lambda):
-        return code.co_name == "<lambda>" and node.lineno == code.co_firstlineno
-    is_named = isinstance(node, ast.FunctionDef) and node.name == code.co_name
-    return isinstance(node, ast.FunctionDef) and is_named and first_line(node) == code.co_firstlineno
-
-
-def _is_repeatable(call: ast.Call, names: Mapping[str, Any], seen: set[types.CodeType], is_unused: bool) -> bool:
-    called, function = call.func, evaluated(call.func, names)
-    if function is None and isinstance(called, ast.Name) and called.id not in names:
-        function = getattr(builtins, called.id, None)
-    if isinstance(function, types.FunctionType) and importable(function) is None:
-        _, node = definition_of(function.__code__)
-        known = function.__code__ in seen
-        seen.add(function.__code__)
-        return known or (node is not None and _unrepeatable(node, function.__globals__, None, seen) is None)
-    is_free = isinstance(called, ast.Name) and called.id in _ORDER_FREE
-    if not is_free and any(_has_no_order(argument, names) for argument in call.args):
-        return False
-    if is_unused or (isinstance(function, type) and importable(function) is None):
-        return True
-    owner = evaluated(called.value, names) if isinstance(called, ast.Attribute) else None
-    if function is None or type(owner) in (str, bytes, tuple, list, dict) or is_plain_array(owner):
-        return isinstance(called, ast.Attribute) and called.attr in _REPEATABLE_METHODS
-    home = importable(function)
-    if home is None:
-        return False
-    top = home.module.partition(".")[0]
-    is_number = top == "numpy" and (type(function).__name__ == "ufunc" or _is_numpy_number(function))
-    return is_number or top in _REPEATABLE_MODULES or home.qualname in _REPEATABLE.get(top, ())
-
-
-def _is_numpy_number(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, sys.modules["numpy"].generic)
