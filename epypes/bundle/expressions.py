@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 from epypes.bundle.resolve import Importable, Refused, importable
-from epypes.bundle.syntax import UNKNOWN, identifier_of, is_same_data, literal_source
+from epypes.bundle.syntax import UNKNOWN, bracketed, identifier_of, is_same_data, literal_source
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
     """
     try:
         return _Writer(gathered, what, wanted).write(value)
-    except RecursionError:  # it holds itself, or is nested deeper than Python reads
+    except (ValueError, RecursionError):  # as for what holds itself, or is nested deeper than Python reads
         return ""
 
 
@@ -87,42 +87,30 @@ class _Writer:
     wanted: str
 
     def write(self, value: Any) -> str:
+        """Return the expression of a value.
+
+        Raises
+        ------
+        ValueError
+            There is none.
+        """
         source = literal_source(value)
         if source:
             return source
-        if type(value) in (tuple, list):
-            inner, brackets = self._joined(value), "[]" if type(value) is list else "()"
-            comma = "," if type(value) is tuple and len(value) == 1 else ""
-            return f"{brackets[0]}{inner}{comma}{brackets[1]}" if inner else ""
-        if type(value) is dict:
-            pairs = [[self.write(part) for part in pair] for pair in value.items()]
-            return f"{{{', '.join(map(': '.join, pairs))}}}" if all(map(all, pairs)) else ""
-        if isinstance(value, re.Pattern):
-            return self._pattern(value)
+        if type(value) in (tuple, list, dict, set):
+            return bracketed(value, self.write)
         made_by, arguments = _call_of(value)
         if made_by is not None:
-            return self._call(made_by, arguments)
+            return f"{self.write(made_by)}({self._joined(arguments)})"
         if is_plain_array(value):
             return self._array(value)
-        return self._record(value) or self._object(value)
+        made = self._record(value) or self._object(value)
+        if not made:
+            raise ValueError(f"no expression makes an object of class {type(value).__name__!r}")
+        return made
 
     def _joined(self, values: Iterable[Any]) -> str:
-        """Return the expressions of values; "" unless all have one."""
-        parts = [self.write(value) for value in values]
-        return ", ".join(parts) if all(parts) else ""
-
-    def _call(self, made_by: Any, arguments: tuple[Any, ...]) -> str:
-        home = importable(made_by)
-        inner = self._joined(arguments) if home else ""
-        return f"{self.gathered.reference(home, self.what)}({inner})" if home and (inner or not arguments) else ""
-
-    def _pattern(self, value: re.Pattern[Any]) -> str:
-        """Return the call that compiles a pattern again, its flags by name."""
-        # The flag for text is what re.compile adds by itself.
-        flags = re.RegexFlag(value.flags) & ~(re.UNICODE if isinstance(value.pattern, str) else re.NOFLAG)
-        module = self.gathered.module_name("re", self.what)
-        named = " | ".join(f"{module}.{flag.name}" for flag in flags)
-        return f"{module}.compile({', '.join(filter(None, (literal_source(value.pattern), named)))})"
+        return ", ".join(map(self.write, values))
 
     def _object(self, value: Any) -> str:
         """Return the expression of what has a name, or a definition in the notebook; "" for any other."""
@@ -131,8 +119,7 @@ class _Writer:
             return gathered.module_name(value.__name__, what)
         if get_origin(value) is Annotated:
             annotated = gathered.reference(Importable("typing", "Annotated"), what)
-            inner = self._joined((value.__origin__, *value.__metadata__))
-            return f"{annotated}[{inner}]" if inner else ""
+            return f"{annotated}[{self._joined((value.__origin__, *value.__metadata__))}]"
         home = importable(value)
         if home is not None:
             return gathered.reference(home, what)
@@ -147,8 +134,9 @@ class _Writer:
         """
         kind, what = type(value), f"Class {type(value).__name__!r} of {self.what[0].lower()}{self.what[1:]}"
         if isinstance(value, enum.Enum):
-            is_member = value.name in kind.__members__
-            return f"{self.gathered.add_class(kind, what)}.{value.name}" if is_member else ""
+            if isinstance(value, enum.Flag) and value.name not in kind.__members__:
+                return " | ".join(map(self.write, value))
+            return f"{self.gathered.add_class(kind, what)}.{value.name}" if value.name in kind.__members__ else ""
         if dataclasses.is_dataclass(kind):
             names = [field.name for field in dataclasses.fields(kind)]
             is_record = all(field.init for field in dataclasses.fields(kind))
@@ -159,13 +147,9 @@ class _Writer:
         if not is_record:
             return ""
         parts = {name: getattr(value, name) for name in names}
-        given = {
-            name: self.write(part)
-            for name, part in parts.items()
-            if not is_same_data(part, defaults.get(name, UNKNOWN))
-        }
-        arguments = ", ".join(f"{name}={source}" for name, source in given.items())
-        return f"{self.gathered.add_class(kind, what)}({arguments})" if all(given.values()) else ""
+        needed = [name for name in names if not is_same_data(parts[name], defaults.get(name, UNKNOWN))]
+        given = ", ".join(f"{name}={self.write(parts[name])}" for name in needed)
+        return f"{self.gathered.add_class(kind, what)}({given})"
 
     def _array(self, array: Any) -> str:
         """Return the expression of an array: its numbers if they are few, else the call that reads it from a file."""
@@ -204,6 +188,9 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
         return range, every if value.step != 1 else every[not value.start : 2]
     if kind is slice:
         return slice, (value.start, value.stop) if value.step is None else (value.start, value.stop, value.step)
+    if kind is re.Pattern:  # the flag for text is what re.compile adds by itself
+        flags = re.RegexFlag(value.flags) & ~(re.UNICODE if isinstance(value.pattern, str) else re.NOFLAG)
+        return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
         return pathlib.Path, (str(value),)
     if kind in _KNOW_THEIR_CALL:

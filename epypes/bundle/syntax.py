@@ -9,10 +9,9 @@ from __future__ import annotations
 import ast
 import itertools
 import keyword
-import operator
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 # Style checkers refuse these as variables, since they look like numbers; nothing can be assigned to __debug__.
@@ -51,9 +50,6 @@ def identifier_of(name: str, is_taken: Callable[[str], bool]) -> str:
 
 
 UNKNOWN: Final = object()
-_OPERATORS: Final[Mapping[type, Callable[[Any, Any], Any]]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-}  # fmt: skip
 
 
 def is_data(value: object) -> bool:
@@ -76,6 +72,17 @@ def has_steady_order(values: Iterable[Any]) -> bool:
     )
 
 
+def bracketed(value: Any, write: Callable[[Any], str]) -> str:
+    """Return the source of a tuple, list, dict or set, whose elements ``write`` writes."""
+    if type(value) is dict:
+        return f"{{{', '.join(f'{write(key)}: {write(item)}' for key, item in value.items())}}}"
+    elements = [*map(write, value)]
+    if type(value) is set:
+        return f"{{{', '.join(elements if has_steady_order(value) else sorted(elements))}}}"
+    inner = ", ".join(elements)
+    return f"[{inner}]" if type(value) is list else f"({inner}{',' if len(elements) == 1 else ''})"
+
+
 def literal(value: Any) -> str:
     """Return the source of a constant: as repr, but with sets sorted whose order changes from process to process.
 
@@ -86,15 +93,8 @@ def literal(value: Any) -> str:
     """
     if type(value) in (str, bytes):
         return quoted(value)
-    if type(value) is set and value:
-        elements = map(literal, value)
-        return "{" + ", ".join(elements if has_steady_order(value) else sorted(elements)) + "}"
-    if type(value) is dict:
-        return "{" + ", ".join(f"{literal(key)}: {literal(item)}" for key, item in value.items()) + "}"
-    if type(value) is list:
-        return "[" + ", ".join(map(literal, value)) + "]"
-    if type(value) is tuple:
-        return "(" + ", ".join(map(literal, value)) + (",)" if len(value) == 1 else ")")
+    if type(value) in (tuple, list, dict) or (type(value) is set and value):
+        return bracketed(value, literal)
     if not is_data(value):  # a kind of str or int inside a tuple would become a plain one
         raise ValueError(f"an object of class {type(value).__name__!r} has no literal")
     return repr(value)
@@ -120,14 +120,10 @@ def is_same_data(written: Any, value: Any) -> bool:
 
 
 def literal_value(expression: ast.expr) -> Any:
-    """Return the value of a literal or of a sum or product of numbers, UNKNOWN for any other expression."""
+    """Return the value of a literal, UNKNOWN for any other expression."""
     try:
-        if isinstance(expression, ast.BinOp) and type(expression.op) in _OPERATORS:
-            left, right = literal_value(expression.left), literal_value(expression.right)
-            are_numbers = type(left) in (int, float, complex) and type(right) in (int, float, complex)
-            return _OPERATORS[type(expression.op)](left, right) if are_numbers else UNKNOWN
         return ast.literal_eval(expression)
-    except (ValueError, TypeError, SyntaxError, ArithmeticError, MemoryError, RecursionError):
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         return UNKNOWN
 
 
