@@ -25,7 +25,7 @@ from functools import lru_cache
 from itertools import takewhile
 from typing import Any, Final
 
-from epypes.bundle.syntax import laid_out
+from epypes.bundle.expressions import laid_out
 
 _CELL_MAGIC: Final = "get_ipython().run_cell_magic("
 _EXECUTING: Final = ("capture", "time", "prun")

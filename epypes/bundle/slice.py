@@ -17,7 +17,20 @@ from functools import partial
 from typing import Any, Final, TypeVar
 
 from epypes.bundle.definitions import Definition, annotated_names, class_definition, defaults_of, function_definition
-from epypes.bundle.expressions import Arrays, expression, is_short
+from epypes.bundle.expressions import (
+    LINE,
+    UNKNOWN,
+    Arrays,
+    expression,
+    identifier_of,
+    is_data,
+    is_identifier,
+    is_same_data,
+    is_short,
+    laid_out,
+    literal_source,
+    literal_value,
+)
 from epypes.bundle.notebook_source import (
     Position,
     Statement,
@@ -35,17 +48,6 @@ from epypes.bundle.notebook_source import (
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable
 from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state, dotted_name
-from epypes.bundle.syntax import (
-    LINE,
-    UNKNOWN,
-    identifier_of,
-    is_data,
-    is_identifier,
-    is_same_data,
-    laid_out,
-    literal_source,
-    literal_value,
-)
 from epypes.run.guard import WATCH, is_plain_array
 
 T = TypeVar("T")

@@ -10,12 +10,10 @@ from typing import Any, Final
 
 from epypes.bundle.clone import called_by, is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import expression_or_none
-from epypes.bundle.module import module_text
-from epypes.bundle.slice import Slice, gather
-from epypes.bundle.syntax import (
+from epypes.bundle.expressions import (
     LINE,
     Item,
+    expression_or_none,
     identifiers_of,
     is_identifier,
     laid_out,
@@ -23,6 +21,8 @@ from epypes.bundle.syntax import (
     one_per_line,
     quoted,
 )
+from epypes.bundle.module import module_text
+from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, as_switch
 from epypes.pipeline import Pipeline

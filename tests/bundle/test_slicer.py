@@ -193,7 +193,7 @@ def test_library_functions_have_a_public_name(value, expected):
 
 @pytest.mark.slow
 def test_a_set_has_the_same_source_under_any_hash_seed():
-    code = "from epypes.bundle.syntax import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
+    code = "from epypes.bundle.expressions import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
     texts = printed(code, "0123")
     assert texts == {'{"a": ({"w", "x", "y", "z"}, [1], (2,), ())}\n'}
 
