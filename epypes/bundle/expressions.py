@@ -11,6 +11,7 @@ import dataclasses
 import enum
 import itertools
 import keyword
+import logging
 import pathlib
 import re
 import sys
@@ -46,7 +47,7 @@ def is_identifier(text: str) -> bool:
 
 
 def identifiers_of(names: Iterable[str], is_taken: Callable[[str], bool]) -> dict[str, str]:
-    """Return a variable for each name, each its own; names that can be kept come first."""
+    """Return a variable for each name, each its own; names that can stay as they are come first."""
     names = list(names)
     found = {name: str.__str__(name) for name in names if is_identifier(name) and not is_taken(name)}
     used = set(found.values())
@@ -152,7 +153,7 @@ def literal_value(expression: ast.expr) -> Any:
 # -- expressions -------------------------------------------------------------------------------------------------------
 
 # Their objects know the call that makes them.
-_KNOW_THEIR_CALL: Final = (itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal)
+_KNOW_THEIR_CALL: Final = (itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal, logging.Logger)
 # More numbers are too many to read.
 _MOST_NUMBERS: Final = 200
 _MOST_CHARACTERS: Final = 400
@@ -242,6 +243,8 @@ class _Writer:
         if get_origin(value) is Annotated:
             annotated = gathered.reference(Importable("typing", "Annotated"), what)
             return f"{annotated}[{self._joined((value.__origin__, *value.__metadata__))}]"
+        if isinstance(value, types.GenericAlias):
+            return f"{self.write(value.__origin__)}[{self._joined(value.__args__)}]"
         home = importable(value)
         if home is not None:
             return gathered.reference(home, what)
@@ -276,7 +279,7 @@ class _Writer:
     def _array(self, array: Any) -> str:
         """Return the expression of an array: its numbers if they are few, else the call that reads it from a file."""
         text = self._numbers(array)
-        if (text and len(text) <= _MOST_CHARACTERS) or not self.gathered.arrays.are_kept:
+        if (text and len(text) <= _MOST_CHARACTERS) or not self.gathered.arrays.has_folder:
             return text
         return self.gathered.arrays.add(self.gathered, array, self.what) if array.dtype.kind in "biufc" else ""
 
@@ -348,13 +351,13 @@ class Arrays:
 
     Parameters
     ----------
-    are_kept
+    has_folder
         Whether there is a folder for them. Without, there is only text.
     """
 
-    def __init__(self, are_kept: bool) -> None:
+    def __init__(self, has_folder: bool) -> None:
         self.by_name: dict[str, Any] = {}
-        self.are_kept = are_kept
+        self.has_folder = has_folder
 
     def reader(self, gathered: Slice) -> str:
         """Return the function that reads the arrays; "" if there are none."""
@@ -364,7 +367,7 @@ class Arrays:
         return _TEXT.format(reader=READER, numpy=numpy, pathlib=pathlib, folder=ARRAYS)
 
     def add(self, gathered: Slice, array: Any, what: str) -> str:
-        """Keep an array of numbers as a file; return the call that reads it."""
+        """Store an array of numbers as a file; return the call that reads it."""
         known = next((name for name, other in self.by_name.items() if other is array), "")
         if known:
             return f'{READER}("{known}")'

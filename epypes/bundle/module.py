@@ -56,7 +56,7 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
                 gathered.reserve("func_groups")
         return text, graphs, own, _enums(gathered, settings)
 
-    gathered, (text, graphs, own, enums) = gather(write, keeps_arrays=True)
+    gathered, (text, graphs, own, enums) = gather(write, stores_arrays=True)
     settings = replace(settings, own=tuple(own))
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))

@@ -1,8 +1,8 @@
 """Promotion: a notebook's graph becomes a bundle.
 
-Resolve every function, slice what it needs, emit the module, record the sample, replay it in a fresh isolated
-process, pin what that imported, seal. Each step may refuse with a reason and a way out; none guesses; and only a
-bundle that passed them all takes the place of an older one.
+Slice what the functions need, write the module, record the samples, replay them in fresh isolated processes, pin what
+those imported, write the manifest. Each step may refuse with a reason and a way out; none guesses. Only a bundle that
+passed them all replaces an older one.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def promote(
         or mappings by token.
     on_progress
         Called with what is being done: the functions are run three times more, to learn which tokens they repeat to
-        the last bit and how far noise puts the others apart.
+        the last bit and how far noise moves the others.
 
     Raises
     ------

@@ -56,15 +56,15 @@ Meaning = tuple[str, object]
 
 
 def gather(
-    write: Callable[[Slice], T], reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False
+    write: Callable[[Slice], T], reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False
 ) -> tuple[Slice, T]:
     """Write a module's objects into a slice; return it, and what ``write`` returns.
 
     It is called twice: only then is it known which names functions read, which nothing else may take.
     """
-    survey = Slice(reserved, keeps_arrays=keeps_arrays)
+    survey = Slice(reserved, stores_arrays=stores_arrays)
     write(survey)
-    gathered = Slice(reserved, keeps_arrays=keeps_arrays)
+    gathered = Slice(reserved, stores_arrays=stores_arrays)
     gathered.read.update(survey.read)
     gathered.captured.update(survey.captured)
     return gathered, write(gathered)
@@ -77,8 +77,8 @@ class Slice:
     ----------
     reserved
         The names that the module keeps for the graph.
-    keeps_arrays
-        Whether large arrays are kept as files beside the module.
+    stores_arrays
+        Whether large arrays are stored as files beside the module.
 
     Attributes
     ----------
@@ -100,8 +100,8 @@ class Slice:
         Why something can't be promoted.
     """
 
-    def __init__(self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False) -> None:
-        self.arrays = Arrays(keeps_arrays)
+    def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
+        self.arrays = Arrays(stores_arrays)
         self.read: dict[str, object] = {}
         self.captured: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
@@ -231,8 +231,8 @@ class Slice:
         if id(function) in self._known:
             return self._known[id(function)]
         name, owner = getattr(function, "__name__", ""), _owner_of(function)
-        if owner is not _NOT_A_METHOD:
-            source = self.reference(home, what) if (home := importable(owner)) else literal_source(owner)
+        if owner is not UNKNOWN:
+            source = expression(self, owner, f"What {what[0].lower()}{what[1:]} is of")
             return f"{f'({source})' if source[0].isdecimal() or source[0] == '-' else source}.{name}"
         if type(function) is partial and not function.__dict__.keys() - {WATCH}:
             inner = f"The function of {what[0].lower()}{what[1:]}"
@@ -328,6 +328,7 @@ class Slice:
         """Write a definition, after what it reads from outside; ``own`` are the names that are its own."""
         self._notebook = self._notebook or found.names
         check_patches(found, what)
+        _check_imports(found, what)
         read = dict.fromkeys(each for code in nested_codes(found.code) for each in names_from_outside(code))
         self.reads[name] = frozenset(read.keys() - set(own))
         for needed in read:
@@ -367,7 +368,7 @@ class Slice:
             if shared is None:
                 kind = f"{what} uses {name!r} from it, of type {type(value).__name__}".removeprefix(f"{what} ")
                 text = f"{what} is defined in the notebook ({found.place_of(name)}) and {kind}"
-                raise Refused(f"{text}. {_way_out(value, name)}, or move both into a module that is installed.")
+                raise Refused(f"{text}. {_way_out(value, name)}.")
             self.claim(name, ("constant", name), what)
             self._import_from(shared, name)
         elif source != name:
@@ -486,18 +487,14 @@ def _position(found: Definition) -> Position:
     return cell_of(found.file, found.names), found.line
 
 
-_NOT_A_METHOD: Final = object()
-
-
 def _owner_of(function: Any) -> Any:
-    """Return what a method is of: a class that can be imported, or a literal that the method does not change."""
-    name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
+    """Return what a method is of, if that is a class, or a literal that the method does not change; else UNKNOWN."""
     if isinstance(function, types.MethodDescriptorType | types.WrapperDescriptorType | types.ClassMethodDescriptorType):
-        return function.__objclass__ if importable(function.__objclass__) else _NOT_A_METHOD
+        return function.__objclass__
+    name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
     if not isinstance(function, types.MethodType | types.BuiltinMethodType) or getattr(owner, name, None) != function:
-        return _NOT_A_METHOD
-    is_class = isinstance(owner, type) and importable(owner) is not None
-    return owner if is_class or (name not in CHANGING and literal_source(owner)) else _NOT_A_METHOD
+        return UNKNOWN
+    return owner if isinstance(owner, type) or (name not in CHANGING and literal_source(owner)) else UNKNOWN
 
 
 def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
@@ -509,9 +506,10 @@ def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
 
 def _way_out(value: Any, name: str) -> str:
     """Return what to do about a value that no expression makes again."""
+    place = "at module level of a module that is imported"
     if is_data(value) or is_plain_array(value):
-        return f"Make {name} a token, or make it inside the function"
-    return f"Make {name} inside the function, or at module level of a module that is imported"
+        return f"Make {name} a token, make it inside the function, or {place}"
+    return f"Make {name} inside the function, or {place}"
 
 
 def _home_of_data(value: Any) -> Importable | None:
@@ -526,6 +524,16 @@ def _home_of_data(value: Any) -> Importable | None:
         if other is value and not name.startswith("_")
     )
     return next(found, None)
+
+
+def _check_imports(found: Definition, what: str) -> None:
+    """Refuse a definition that imports the notebook itself."""
+    for node in ast.walk(found.node):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [getattr(node, "module", ""), *(alias.name for alias in node.names)]
+            if "__main__" in modules:
+                text = f"{what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
+                raise Refused(f"{text}. Use what it has by its own name, without the module.")
 
 
 def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
