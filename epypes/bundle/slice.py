@@ -283,18 +283,14 @@ class Slice:
             self._write(factory, f"def {factory}{whole}", found, what, {*given, inner})
         arguments = ", ".join(f"{each}={source}" for each, source in given.items())
         self.definitions[name] = f"{name} = {self._makers[key]}({arguments})\n"
+        self.positions[name] = _position(found)
         self.closures.add(name)
-        statement = next(statements_of(name, found.names, found.file), None)
-        self.positions[name] = (statement.cell, statement.node.lineno) if statement else _position(found)
 
     def _name_for(self, function: object, found: Definition, wanted: str) -> str:
         """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
         own = "" if found.is_lambda else found.name
-        others = [wanted, own]
-        if found.names.get(own) is function and not found.captured:
-            others.reverse()
-        bound = names_of(function, found.names)
-        candidates = [*(name for name in bound if name == own), *bound, *others]
+        known = [own] if found.names.get(own) is function else []
+        candidates = [*known, *names_of(function, found.names), wanted, own]
         free = (name for name in candidates if name and self._is_free(name, function))
         return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
 
@@ -366,9 +362,8 @@ class Slice:
         if not source or not (is_short(source) or callable(value)):
             shared = _home_of_data(value)
             if shared is None:
-                kind = f"{what} uses {name!r} from it, of type {type(value).__name__}".removeprefix(f"{what} ")
-                text = f"{what} is defined in the notebook ({found.place_of(name)}) and {kind}"
-                raise Refused(f"{text}. {_way_out(value, name)}.")
+                text = f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it"
+                raise Refused(f"{text}, of type {type(value).__name__}. {_way_out(value, name)}.")
             self.claim(name, ("constant", name), what)
             self._import_from(shared, name)
         elif source != name:
