@@ -10,7 +10,7 @@ from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner
 from epypes.run.guard import as_written
 
-# A node may be made to wrap itself; nobody wraps this deep on purpose.
+# A node may be made to wrap itself; no graph needs to wrap this deep.
 _DEEPEST: Final = 100
 
 
@@ -36,7 +36,7 @@ def is_plain_pipeline(function: Any) -> TypeGuard[Pipeline]:
 def clone_graph(cg: CompGraph) -> CompGraph:
     """Return the same graph with nodes and pipelines of its own, whose times and counts the user does not see.
 
-    Nodes and pipelines that do something of their own are kept, since only they know what else they do.
+    Nodes and pipelines that do something of their own stay themselves: a copy could not do it.
     """
     functions = {name: _clone(function) for name, function in cg.functions.items()}
     is_same = all(function is cg.functions[name] for name, function in functions.items())

@@ -15,7 +15,7 @@ import types
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
-from typing import Any
+from typing import Any, TypeGuard
 
 from epypes.bundle.notebook_source import (
     LATE_ANNOTATIONS,
@@ -195,14 +195,12 @@ def _check_decorator(decorator: ast.expr, wrapper: Any, function: types.Function
     """Refuse a decorator that keeps something from call to call."""
     place = place_in(function.__code__.co_filename, decorator.lineno)
     what = f"{what} is wrapped by a decorator, @{ast.unparse(decorator)} ({place}):"
-    code = wrapper.__code__ if isinstance(wrapper, types.FunctionType) and importable(wrapper) is None else None
+    code = wrapper.__code__ if _is_of_notebook(wrapper) else None
     node = definition_of(code)[1] if code is not None else None
-    if node is not None and not _is_of_library(wrapper):
+    if node is not None:
         check_state(wrapper, node, f"{what} {wrapper.__code__.co_name!r}")
     made_by = _target(decorator, function)
-    if not isinstance(made_by, types.FunctionType) or importable(made_by) is not None:
-        return
-    _, factory = definition_of(made_by.__code__)
+    factory = definition_of(made_by.__code__)[1] if _is_of_notebook(made_by) else None
     if factory is None:
         return
     try:
@@ -214,18 +212,18 @@ def _check_decorator(decorator: ast.expr, wrapper: Any, function: types.Function
         ) from refusal
 
 
-def _is_of_library(function: types.FunctionType) -> bool:
-    """Whether the code of a function is from a module that can be imported, as that of functools."""
-    home = sys.modules.get(str(function.__globals__.get("__name__")))
-    return home is not None and home.__name__ != "__main__" and vars(home) is function.__globals__
+def _is_of_notebook(function: Any) -> TypeGuard[types.FunctionType]:
+    """Whether this is a function of the notebook, or of a module that can't be imported, as that of a bundle."""
+    if not isinstance(function, types.FunctionType):
+        return False
+    home = function.__globals__.get("__name__")
+    return home == "__main__" or home not in sys.modules
 
 
 def _no_definition(value: Any, decorators: Collection[ast.expr], what: str) -> str:
     """Return why something that can be called has no definition that makes it."""
     if isinstance(value, types.MethodType | types.BuiltinMethodType):
         kind, text = type(value.__self__), f"a method of an object of class {type(value.__self__).__name__!r}"
-    elif isinstance(value, functools.partial):
-        kind, text = type(value), "a functools.partial that was changed"
     else:
         kind, text = type(value), f"an object of class {type(value).__name__!r}"
     names = vars(sys.modules["__main__"])
@@ -319,7 +317,5 @@ def _functions_in(value: Any) -> Iterator[types.FunctionType]:
     if isinstance(value, functools.cached_property):
         parts.append(value.func)
     for part in parts:
-        if isinstance(part, types.FunctionType) and lines_in(part.__code__.co_filename):
-            home = part.__globals__.get("__name__")
-            if home == "__main__" or home not in sys.modules:
-                yield part
+        if _is_of_notebook(part) and lines_in(part.__code__.co_filename):
+            yield part

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from epypes.bundle.definitions import functions_of
-from epypes.bundle.expressions import expression_or_none
+from epypes.bundle.expressions import UNKNOWN, Item, expression_or_none, is_same_data, laid_out, one_per_line, quoted
 from epypes.bundle.notebook_source import nested_codes
 from epypes.bundle.resolve import Refused
 from epypes.bundle.slice import Slice
-from epypes.bundle.syntax import UNKNOWN, Item, is_same_data, laid_out, one_per_line, quoted
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written
@@ -131,14 +130,13 @@ class Graphs:
             known = f"{self._epypes(what)}.Pipeline"
         else:
             known = self.gathered.add_class(kind, f"Class {kind.__name__!r}{_inside(what)}")
-        arguments, lines, names = list[str](), list[str](), by_position(kind)
+        arguments, lines = list[str](), list[str]()
         for parameter, value in given.items():
             if isinstance(value, CompGraph):
                 source, lines = self._inner_graph(value, what, name)
             else:
                 source = self.value(value, what, f"{name}_{parameter}")
-            is_next = names[: len(arguments) + 1] == [*given][: len(arguments) + 1]
-            arguments.append(source if is_next else f"{parameter}={source}")
+            arguments.append(f"{parameter}={source}")
         variable = self.gathered.free_name(name)
         self.blocks.append([*lines, *laid_out(f"{known}({', '.join(arguments)})", before=f"{variable} = ")])
         return variable
@@ -194,13 +192,6 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
         if value is not UNKNOWN and value is not parameter.default and not is_same_data(value, parameter.default):
             found[parameter.name] = value
     return found
-
-
-def by_position(kind: type) -> list[str]:
-    """Return the arguments that may be given by position, in order."""
-    first = next(above for above in kind.__mro__ if "__init__" in vars(above))
-    _, *parameters = inspect.signature(vars(first)["__init__"]).parameters.values()
-    return [parameter.name for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
 
 
 def parameters_of(kind: type) -> Iterator[inspect.Parameter]:

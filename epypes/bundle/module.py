@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import expression
+from epypes.bundle.expressions import LINE, expression, laid_out, one_per_line, quoted
 from epypes.bundle.graphs import Graphs, GraphText, arguments_of, parameters_of
 from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.load import MAKER
@@ -21,7 +21,6 @@ from epypes.bundle.notebook_source import Position, parsed
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings
 from epypes.bundle.slice import Slice, gather
-from epypes.bundle.syntax import LINE, laid_out, one_per_line, quoted
 from epypes.errors import run_call
 from epypes.graph import CompGraph
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
@@ -57,7 +56,7 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
                 gathered.reserve("func_groups")
         return text, graphs, own, _enums(gathered, settings)
 
-    gathered, (text, graphs, own, enums) = gather(write, keeps_arrays=True)
+    gathered, (text, graphs, own, enums) = gather(write, stores_arrays=True)
     settings = replace(settings, own=tuple(own))
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))

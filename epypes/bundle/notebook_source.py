@@ -25,7 +25,7 @@ from functools import lru_cache
 from itertools import takewhile
 from typing import Any, Final
 
-from epypes.bundle.syntax import laid_out
+from epypes.bundle.expressions import laid_out
 
 _CELL_MAGIC: Final = "get_ipython().run_cell_magic("
 _EXECUTING: Final = ("capture", "time", "prun")
@@ -176,8 +176,8 @@ def definition_of(code: types.CodeType) -> tuple[list[str], ast.FunctionDef | No
 
 
 def _defined_as(lines: list[str], code: types.CodeType) -> ast.FunctionDef | None:
-    for apart in (False, True):
-        known = _definitions("".join(lines), code.co_flags & LATE_ANNOTATIONS, apart)
+    for by_statement in (False, True):
+        known = _definitions("".join(lines), code.co_flags & LATE_ANNOTATIONS, by_statement)
         found = known.get((code.co_name, code.co_firstlineno))
         if found is not None and computes_the_same(found[1], code):
             return found[0]
@@ -185,23 +185,25 @@ def _defined_as(lines: list[str], code: types.CodeType) -> ast.FunctionDef | Non
 
 
 @lru_cache(maxsize=16)  # one cell often defines many functions
-def _definitions(source: str, flags: int, apart: bool) -> dict[tuple[str, int], tuple[ast.FunctionDef, types.CodeType]]:
+def _definitions(
+    source: str, flags: int, by_statement: bool
+) -> dict[tuple[str, int], tuple[ast.FunctionDef, types.CodeType]]:
     """Return the definitions in a cell, with their code, by name and first line, decorators included."""
     tree = parsed(source)
     if tree is None:
         return {}
-    codes = {(code.co_name, code.co_firstlineno): code for code in codes_in(tree, flags, apart)}
+    codes = {(code.co_name, code.co_firstlineno): code for code in codes_in(tree, flags, by_statement)}
     nodes = ((node.name, first_line(node), node) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
     return {(name, line): (node, codes[name, line]) for name, line, node in nodes if (name, line) in codes}
 
 
-def codes_in(tree: ast.Module, flags: int, apart: bool) -> Iterator[types.CodeType]:
+def codes_in(tree: ast.Module, flags: int, by_statement: bool) -> Iterator[types.CodeType]:
     """Return all code in a script, or in a cell.
 
-    A script is compiled as a whole, a cell statement by statement (``apart``). That is not the same: Python calls
-    ``cv2.blur`` in another way where it sees that cv2 is imported.
+    A script is compiled as a whole, a cell ``by_statement``. That is not the same: Python calls ``cv2.blur`` in
+    another way where it sees that cv2 is imported.
     """
-    units = [ast.Module([statement], []) for statement in tree.body] if apart else [tree]
+    units = [ast.Module([statement], []) for statement in tree.body] if by_statement else [tree]
     for unit in units:
         module = compiled(unit, flags)
         yield from nested_codes(module) if module else ()
@@ -278,8 +280,8 @@ def own_text(lines: list[str], node: ast.FunctionDef | ast.ClassDef, dropped: Co
     first = first_line(node) - 1
     margin = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
     gone = {number for decorator in dropped for number in range(decorator.lineno, (decorator.end_lineno or 0) + 1)}
-    kept = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in gone]
-    return "".join(f"{line}\n" for line in above) + _dedented(kept, margin).rstrip() + "\n"
+    lines_left = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in gone]
+    return "".join(f"{line}\n" for line in above) + _dedented(lines_left, margin).rstrip() + "\n"
 
 
 def renamed(text: str, old: str, new: str) -> str:
@@ -385,7 +387,7 @@ def lambdas_of(code: types.CodeType) -> tuple[list[str], list[ast.Lambda]]:
         return lines, []
     nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Lambda) and node.lineno == code.co_firstlineno]
     flags = code.co_flags & LATE_ANNOTATIONS
-    others = [other for apart in (False, True) for other in codes_in(tree, flags, apart)]
+    others = [other for by_statement in (False, True) for other in codes_in(tree, flags, by_statement)]
     # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
     if not any(other.co_linetable == code.co_linetable and _is_same_place(other, code) for other in others):
         return lines, []

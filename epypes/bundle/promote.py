@@ -1,8 +1,8 @@
 """Promotion: a notebook's graph becomes a bundle.
 
-Resolve every function, slice what it needs, emit the module, record the sample, replay it in a fresh isolated
-process, pin what that imported, seal. Each step may refuse with a reason and a way out; none guesses; and only a
-bundle that passed them all takes the place of an older one.
+Slice what the functions need, write the module, record the samples, replay them in fresh isolated processes, pin what
+those imported, write the manifest. Each step may refuse with a reason and a way out; none guesses. Only a bundle that
+passed them all replaces an older one.
 """
 
 from __future__ import annotations
@@ -76,25 +76,19 @@ def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:
     Refused
         It is neither a runner nor a pipeline, or a port is no function.
     """
-    for name, function in (("f_in", f_in), ("f_out", f_out)):
-        if function is not None and not callable(function):
-            raise Refused(f"{name} must be a function, not {type(function).__name__!r}.")
-    if isinstance(given, CompGraphRunner):
-        return Subject(given, given.cg, None, _ports({}, f_in, f_out))
-    if not isinstance(given, Pipeline):
+    ports = {"f_in": f_in, "f_out": f_out}
+    for name, port in ports.items():
+        if port is not None and not callable(port):
+            raise Refused(f"{name} must be a function, not {type(port).__name__!r}.")
+    if isinstance(given, Pipeline):  # its class may also make a port itself
+        taken = {parameter.name for parameter in parameters_of(type(given))}
+        ports |= {name: getattr(given, name, None) for name in ports if ports[name] is None and name in taken}
+    elif not isinstance(given, CompGraphRunner):
         raise Refused(_NO_RUNNER.format(type(given).__name__))
-    own = {name: getattr(given, name, None) for name in ("f_in", "f_out") if _is_port(given, name)}
-    return Subject(given.runner, given.source_cg, given, _ports(own, f_in, f_out), dict(given.attributes))
-
-
-def _ports(own: Mapping[str, Any], f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]]:
-    found = {**own, **{name: port for name, port in (("f_in", f_in), ("f_out", f_out)) if port is not None}}
-    return {name: as_written(port) for name, port in found.items() if port is not None and not is_usual(port)}
-
-
-def _is_port(pipeline: Pipeline, name: str) -> bool:
-    """Whether a pipeline was given a port, which its class may also make itself."""
-    return any(parameter.name == name for parameter in parameters_of(type(pipeline)))
+    own = {name: as_written(port) for name, port in ports.items() if port is not None and not is_usual(port)}
+    if isinstance(given, Pipeline):
+        return Subject(given.runner, given.source_cg, given, own, dict(given.attributes))
+    return Subject(given, given.cg, None, own)
 
 
 def _ignore(text: str) -> None:
@@ -129,7 +123,7 @@ def promote(
         or mappings by token.
     on_progress
         Called with what is being done: the functions are run three times more, to learn which tokens they repeat to
-        the last bit and how far noise puts the others apart.
+        the last bit and how far noise moves the others.
 
     Raises
     ------

@@ -17,7 +17,20 @@ from functools import partial
 from typing import Any, Final, TypeVar
 
 from epypes.bundle.definitions import Definition, annotated_names, class_definition, defaults_of, function_definition
-from epypes.bundle.expressions import Arrays, expression, is_short
+from epypes.bundle.expressions import (
+    LINE,
+    UNKNOWN,
+    Arrays,
+    expression,
+    identifier_of,
+    is_data,
+    is_identifier,
+    is_same_data,
+    is_short,
+    laid_out,
+    literal_source,
+    literal_value,
+)
 from epypes.bundle.notebook_source import (
     Position,
     Statement,
@@ -35,17 +48,6 @@ from epypes.bundle.notebook_source import (
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable
 from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state, dotted_name
-from epypes.bundle.syntax import (
-    LINE,
-    UNKNOWN,
-    identifier_of,
-    is_data,
-    is_identifier,
-    is_same_data,
-    laid_out,
-    literal_source,
-    literal_value,
-)
 from epypes.run.guard import WATCH, is_plain_array
 
 T = TypeVar("T")
@@ -54,15 +56,15 @@ Meaning = tuple[str, object]
 
 
 def gather(
-    write: Callable[[Slice], T], reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False
+    write: Callable[[Slice], T], reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False
 ) -> tuple[Slice, T]:
     """Write a module's objects into a slice; return it, and what ``write`` returns.
 
     It is called twice: only then is it known which names functions read, which nothing else may take.
     """
-    survey = Slice(reserved, keeps_arrays=keeps_arrays)
+    survey = Slice(reserved, stores_arrays=stores_arrays)
     write(survey)
-    gathered = Slice(reserved, keeps_arrays=keeps_arrays)
+    gathered = Slice(reserved, stores_arrays=stores_arrays)
     gathered.read.update(survey.read)
     gathered.captured.update(survey.captured)
     return gathered, write(gathered)
@@ -75,8 +77,8 @@ class Slice:
     ----------
     reserved
         The names that the module keeps for the graph.
-    keeps_arrays
-        Whether large arrays are kept as files beside the module.
+    stores_arrays
+        Whether large arrays are stored as files beside the module.
 
     Attributes
     ----------
@@ -98,8 +100,8 @@ class Slice:
         Why something can't be promoted.
     """
 
-    def __init__(self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False) -> None:
-        self.arrays = Arrays(keeps_arrays)
+    def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
+        self.arrays = Arrays(stores_arrays)
         self.read: dict[str, object] = {}
         self.captured: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
@@ -229,8 +231,8 @@ class Slice:
         if id(function) in self._known:
             return self._known[id(function)]
         name, owner = getattr(function, "__name__", ""), _owner_of(function)
-        if owner is not _NOT_A_METHOD:
-            source = self.reference(home, what) if (home := importable(owner)) else literal_source(owner)
+        if owner is not UNKNOWN:
+            source = expression(self, owner, f"What {what[0].lower()}{what[1:]} is of")
             return f"{f'({source})' if source[0].isdecimal() or source[0] == '-' else source}.{name}"
         if type(function) is partial and not function.__dict__.keys() - {WATCH}:
             inner = f"The function of {what[0].lower()}{what[1:]}"
@@ -281,18 +283,14 @@ class Slice:
             self._write(factory, f"def {factory}{whole}", found, what, {*given, inner})
         arguments = ", ".join(f"{each}={source}" for each, source in given.items())
         self.definitions[name] = f"{name} = {self._makers[key]}({arguments})\n"
+        self.positions[name] = _position(found)
         self.closures.add(name)
-        statement = next(statements_of(name, found.names, found.file), None)
-        self.positions[name] = (statement.cell, statement.node.lineno) if statement else _position(found)
 
     def _name_for(self, function: object, found: Definition, wanted: str) -> str:
         """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
         own = "" if found.is_lambda else found.name
-        others = [wanted, own]
-        if found.names.get(own) is function and not found.captured:
-            others.reverse()
-        bound = names_of(function, found.names)
-        candidates = [*(name for name in bound if name == own), *bound, *others]
+        known = [own] if found.names.get(own) is function else []
+        candidates = [*known, *names_of(function, found.names), wanted, own]
         free = (name for name in candidates if name and self._is_free(name, function))
         return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
 
@@ -326,6 +324,7 @@ class Slice:
         """Write a definition, after what it reads from outside; ``own`` are the names that are its own."""
         self._notebook = self._notebook or found.names
         check_patches(found, what)
+        _check_imports(found, what)
         read = dict.fromkeys(each for code in nested_codes(found.code) for each in names_from_outside(code))
         self.reads[name] = frozenset(read.keys() - set(own))
         for needed in read:
@@ -363,9 +362,8 @@ class Slice:
         if not source or not (is_short(source) or callable(value)):
             shared = _home_of_data(value)
             if shared is None:
-                kind = f"{what} uses {name!r} from it, of type {type(value).__name__}".removeprefix(f"{what} ")
-                text = f"{what} is defined in the notebook ({found.place_of(name)}) and {kind}"
-                raise Refused(f"{text}. {_way_out(value, name)}, or move both into a module that is installed.")
+                text = f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it"
+                raise Refused(f"{text}, of type {type(value).__name__}. {_way_out(value, name)}.")
             self.claim(name, ("constant", name), what)
             self._import_from(shared, name)
         elif source != name:
@@ -484,18 +482,14 @@ def _position(found: Definition) -> Position:
     return cell_of(found.file, found.names), found.line
 
 
-_NOT_A_METHOD: Final = object()
-
-
 def _owner_of(function: Any) -> Any:
-    """Return what a method is of: a class that can be imported, or a literal that the method does not change."""
-    name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
+    """Return what a method is of, if that is a class, or a literal that the method does not change; else UNKNOWN."""
     if isinstance(function, types.MethodDescriptorType | types.WrapperDescriptorType | types.ClassMethodDescriptorType):
-        return function.__objclass__ if importable(function.__objclass__) else _NOT_A_METHOD
+        return function.__objclass__
+    name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
     if not isinstance(function, types.MethodType | types.BuiltinMethodType) or getattr(owner, name, None) != function:
-        return _NOT_A_METHOD
-    is_class = isinstance(owner, type) and importable(owner) is not None
-    return owner if is_class or (name not in CHANGING and literal_source(owner)) else _NOT_A_METHOD
+        return UNKNOWN
+    return owner if isinstance(owner, type) or (name not in CHANGING and literal_source(owner)) else UNKNOWN
 
 
 def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
@@ -507,9 +501,10 @@ def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
 
 def _way_out(value: Any, name: str) -> str:
     """Return what to do about a value that no expression makes again."""
+    place = "at module level of a module that is imported"
     if is_data(value) or is_plain_array(value):
-        return f"Make {name} a token, or make it inside the function"
-    return f"Make {name} inside the function, or at module level of a module that is imported"
+        return f"Make {name} a token, make it inside the function, or {place}"
+    return f"Make {name} inside the function, or {place}"
 
 
 def _home_of_data(value: Any) -> Importable | None:
@@ -524,6 +519,16 @@ def _home_of_data(value: Any) -> Importable | None:
         if other is value and not name.startswith("_")
     )
     return next(found, None)
+
+
+def _check_imports(found: Definition, what: str) -> None:
+    """Refuse a definition that imports the notebook itself."""
+    for node in ast.walk(found.node):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [getattr(node, "module", ""), *(alias.name for alias in node.names)]
+            if "__main__" in modules:
+                text = f"{what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
+                raise Refused(f"{text}. Use what it has by its own name, without the module.")
 
 
 def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:

@@ -10,12 +10,10 @@ from typing import Any, Final
 
 from epypes.bundle.clone import called_by, is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import expression_or_none
-from epypes.bundle.module import module_text
-from epypes.bundle.slice import Slice, gather
-from epypes.bundle.syntax import (
+from epypes.bundle.expressions import (
     LINE,
     Item,
+    expression_or_none,
     identifiers_of,
     is_identifier,
     laid_out,
@@ -23,6 +21,8 @@ from epypes.bundle.syntax import (
     one_per_line,
     quoted,
 )
+from epypes.bundle.module import module_text
+from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, as_switch
 from epypes.pipeline import Pipeline
@@ -245,11 +245,6 @@ class _Part:
         seen = {*used, *(token for name in functions for token in cg.func_outputs(name))}
         return functions, [token for token in cg.tokens if token in seen]
 
-    @property
-    def is_too_deep(self) -> bool:
-        """Whether switches stand in switches too often to be read."""
-        return any(region.depth > _DEEPEST for regions in self.branches.values() for region in regions)
-
     def text(self) -> str:
         """Return the function."""
         self.variables = variables = identifiers_of(self.tokens, self._hidden().__contains__)
@@ -409,7 +404,7 @@ def _unwritable(parts: Sequence[_Part], name: str, wanted: Sequence[str] | None)
     if wanted == ():
         yield "returns is empty: name at least one token, or leave it out for the sink tokens."
     for part in parts:
-        if part.is_too_deep:
+        if any(region.depth > _DEEPEST for regions in part.branches.values() for region in regions):
             text = f"The switches{part.where} stand in one another too deep to be indented."
             yield f"{text} Make the inner ones a Pipeline, which becomes a function of its own."
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any, Final
 
-from epypes.bundle.syntax import literal_source
+from epypes.bundle.expressions import literal_source
 from epypes_widgets.values import differing, listed
 
 # A longer text of one value is for a file, not for a line.
