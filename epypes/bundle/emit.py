@@ -13,11 +13,10 @@ from typing import Any, Final
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import noted_refusals
 from epypes.bundle.graphs import Graphs, GraphText
-from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.load import MAKER
 from epypes.bundle.module import module_text
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import Settings
+from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice
 from epypes.bundle.subject import Subject, own_lines
 from epypes.bundle.syntax import LINE, one_per_line, quoted
