@@ -44,7 +44,7 @@ from typing import Any, Final
 
 from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, read_value
 from epypes.batch.metrics import METRICS
-from epypes.bundle.hyperparameters import read
+from epypes.bundle.settings import read
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.wording import ended

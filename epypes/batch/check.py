@@ -36,7 +36,7 @@ from epypes.batch.results import (
 )
 from epypes.batch.thumbnails import DIFFERENCE_LEGEND, comparison_thumbnails
 from epypes.bundle.compare import first_difference
-from epypes.bundle.hyperparameters import Member
+from epypes.bundle.settings import Member
 from epypes.display.markup import content, fitted
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph

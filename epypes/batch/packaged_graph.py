@@ -24,8 +24,8 @@ from epypes.batch.job import Job, RunnerPool, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
 from epypes.bundle.fingerprint import combined_digest
-from epypes.bundle.hyperparameters import Unwritable, members_in, read, written
 from epypes.bundle.load import SAMPLES, Bundle, read_bundle
+from epypes.bundle.settings import Unwritable, members_in, read, written
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array

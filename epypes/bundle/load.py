@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
-from epypes.bundle.hyperparameters import StoredArray, load_array
 from epypes.bundle.manifest import bundle_files, check_manifest
 from epypes.bundle.mutable_state import MutableState, check_caches
-from epypes.bundle.settings import Settings, read_settings
+from epypes.bundle.settings import Settings, StoredArray, load_array, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
 from epypes.pipeline import FullPipeline

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import LINE, expression, laid_out, one_per_line, quoted
 from epypes.bundle.graphs import Graphs, GraphText, arguments_of, parameters_of
-from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.load import MAKER
 from epypes.bundle.notebook_source import Position, parsed
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import Settings
+from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import run_call
 from epypes.graph import CompGraph

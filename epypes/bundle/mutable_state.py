@@ -148,7 +148,7 @@ class CodeSnapshot(Snapshot):
         if issubclass(kind, Node):
             return self._look_at_node(name, value)
         if kind is _CACHED:
-            return self._look_at_cache(value)
+            return self._look_at_cache(name, value)
         return self._look_at_object(name, value)
 
     def _look_at_object(self, name: str, value: Any) -> Found:
@@ -227,14 +227,14 @@ class CodeSnapshot(Snapshot):
             self._settlers.append(_Bindings(f"{name}.", node).settle)
             yield from ((f"{name}.{key}", value) for key, value in _bound(node).items())
 
-    def _look_at_cache(self, cached: Any) -> Found:
+    def _look_at_cache(self, name: str, cached: Any) -> Found:
         """Look into the function behind an lru_cache."""
         if is_own(str(cached.__module__)):
             if self._lock:
-                self._caches.append(getattr(cached, _CHECK, None) or _CacheCheck(cached, is_complete=False))
+                self._caches.append(getattr(cached, _CHECK, None) or _CacheCheck(name, cached, is_complete=False))
             else:
-                yield from ((cached.__name__, value) for value in cached_values(cached))
-        yield cached.__name__, cached.__wrapped__
+                yield from ((name, value) for value in cached_values(cached))
+        yield name, cached.__wrapped__
 
     def _may_bind(self, needed: frozenset[str], name: str, value: Any) -> None:
         self._possible.append((needed, functools.partial(_Bindings, name, value)))
@@ -312,7 +312,6 @@ def _write_bindings(value: Any, saved: tuple[Any, ...]) -> None:
     before, now = as_dict(saved), dict(_bound(value))
     if type(value) is dict:
         bind, delete = dict.__setitem__, dict.__delitem__
-        now = {name: part for name, part in now.items() if name in before or not isinstance(part, types.ModuleType)}
     else:
         owner: Any = type if isinstance(value, type) else object
         bind, delete = owner.__setattr__, owner.__delattr__
@@ -342,15 +341,17 @@ class _CacheCheck:
 
     Parameters
     ----------
+    name
+        What the code calls the cache.
     cached
         The cache.
     is_complete
-        Whether all its values are known here; else it has to be empty after each call.
+        Whether each value was added here; else no mutable one may stay in it after a call.
     """
 
-    def __init__(self, cached: Any, *, is_complete: bool = True) -> None:
-        self.name: str = cached.__name__
-        self._cached, self._is_complete = cached, is_complete
+    def __init__(self, name: str, cached: Any, *, is_complete: bool) -> None:
+        self.name, self._cached, self._is_complete = name, cached, is_complete
+        self._misses = 0
         self._snapshots: list[CodeSnapshot] = []
 
     def add(self, value: Any) -> None:
@@ -367,35 +368,40 @@ class _CacheCheck:
         """Whether there are values that are not compared, or too many."""
         if self._is_complete:
             return len(self._snapshots) > _MOST_CHECKED
-        return bool(self._cached.cache_info().currsize)
+        misses = self._cached.cache_info().misses
+        if misses != self._misses and CodeSnapshot({self.name: (*cached_values(self._cached),)}, lock=False):
+            return True
+        self._misses = misses
+        return False
 
     def clear(self) -> None:
         """Empty the cache."""
         self._cached.cache_clear()
         self._snapshots.clear()
+        self._misses = 0
 
 
 def check_caches(names: dict[str, Any]) -> None:
     """Have each lru_cache among the names of a module, in its dicts and classes note what its function returns."""
     made: dict[int, Any] = {}
 
-    def checked(value: Any) -> Any:
-        if type(value) is not _CACHED or not is_own(str(value.__module__)):
+    def checked(name: str, value: Any) -> Any:
+        if not is_own(str(value.__module__)):
             return value
         if id(value) not in made:
-            made[id(value)] = _checked(value)
+            made[id(value)] = _checked(name, value)
         return made[id(value)]
 
     for value in [names, *names.values()]:
         if type(value) is dict:
-            value.update({key: checked(part) for key, part in value.items()})
+            value.update({key: checked(str(key), part) for key, part in value.items() if type(part) is _CACHED})
         elif isinstance(value, type) and is_own(str(value.__module__)):
             for name, part in [*vars(value).items()]:
                 if type(part) is _CACHED:
-                    type.__setattr__(value, name, checked(part))
+                    type.__setattr__(value, name, checked(f"{value.__name__}.{name}", part))
 
 
-def _checked(cached: Any) -> Any:
+def _checked(name: str, cached: Any) -> Any:
     """Return a new cache of the same function, whose values are compared."""
     function = cached.__wrapped__
 
@@ -405,7 +411,7 @@ def _checked(cached: Any) -> Any:
         return result
 
     again = functools.update_wrapper(functools.lru_cache(**cached.cache_parameters())(compute), function)
-    check = _CacheCheck(again)
+    check = _CacheCheck(name, again, is_complete=True)
     setattr(again, _CHECK, check)
     return again
 

@@ -18,13 +18,19 @@ from epypes.bundle.clone import clone_runner
 from epypes.bundle.determinism import learn
 from epypes.bundle.expressions import write_arrays
 from epypes.bundle.graphs import parameters_of
-from epypes.bundle.hyperparameters import store_arrays, write_stored_arrays
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.proof import prove, swap_folders
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
+from epypes.bundle.settings import (
+    Settings,
+    store_arrays,
+    unwritable,
+    writable_defaults,
+    write_settings,
+    write_stored_arrays,
+)
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import CompGraph, colour_order
 from epypes.pipeline import Pipeline

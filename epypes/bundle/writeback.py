@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.hyperparameters import alike, fits, read, written
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest, digest
 from epypes.bundle.proof import prove, swap_folders
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
+from epypes.bundle.settings import alike, fits, read, written
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
 

@@ -95,7 +95,7 @@ class Deployer:
         return self._exclusive(self._supervisor.bundle.path, lambda: self._write_back(dry_run))
 
     def _write_back(self, dry_run: bool) -> WriteBack:
-        from epypes.bundle.hyperparameters import read
+        from epypes.bundle.settings import read
         from epypes.bundle.writeback import write_back
 
         before = self._supervisor.bundle

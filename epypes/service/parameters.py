@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.bundle.hyperparameters import written
+from epypes.bundle.settings import written
 from epypes.errors import ParametersRefused, RevisionConflict, ServiceError, UnknownName
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _log = logging.getLogger("epypes.service")
 Entries = Mapping[str, Mapping[str, Any]]
 # Of one step: a float that was typed or sent as text is not on a step to the last bit.
 _STEP_TOLERANCE: Final = 1e-6
-# Kinds of `epypes.bundle.hyperparameters` that JSON can give: a number, a text or a flat list.
+# Kinds of `epypes.bundle.settings` that JSON can give: a number, a text or a flat list.
 _KINDS: Final = (None, "none", "tuple", "numpy", "enum")
 _VALUE_KEYS: Final = ("value", "kind", "dtype", "enum", "shape")
 _TYPES: Final[Mapping[type, str]] = {bool: "bool", int: "int", float: "float", str: "text", list: "list"}

@@ -15,8 +15,19 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import epypes as ep
-from epypes.bundle.hyperparameters import MOST_NUMBERS, Member, Unwritable, alike, fits, read, written
-from epypes.bundle.settings import Settings, read_settings, unwritable, write_settings
+from epypes.bundle.settings import (
+    MOST_NUMBERS,
+    Member,
+    Settings,
+    Unwritable,
+    alike,
+    fits,
+    read,
+    read_settings,
+    unwritable,
+    write_settings,
+    written,
+)
 
 
 class Method(enum.Enum):

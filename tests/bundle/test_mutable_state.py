@@ -108,7 +108,7 @@ KEPT = {
     ),
     "dict in a tuple of a method's cache": (
         "class C:\n    @functools.cache\n    def table(self, n): return n, {}\nc = C()\n"
-        "def f(x):\n    found = c.table(3)[1]\n    if x > 100: found[x] = 1\n    return len(found)", "table",
+        "def f(x):\n    found = c.table(3)[1]\n    if x > 100: found[x] = 1\n    return len(found)", "C.table",
     ),
     "SimpleNamespace": ("import types\ns = types.SimpleNamespace(n=0)\ndef f(x):\n    if x > 100: s.n += 1\n    return s.n", "s"),
     "random generator": ("rng = random.Random(0)\ndef f(x):\n    return rng.random() if x > 100 else rng.getstate()[1][:2]", "rng"),
@@ -204,6 +204,7 @@ CONSTANT = {
     "def f(x):\n    c.items.append(x)\n    return len(c.items)",
     "list of a cache that no name of the module has": "def make():\n    @functools.cache\n    def items(n): return [n]\n    def f(x):\n        found = items(3)\n"
     "        found.append(x)\n        return len(found)\n    return f\nf = make()",
+    "cache of a partial": "g = functools.cache(functools.partial(max, 3))\ndef f(x):\n    return g(x)",
     "more mutable values than a cache may have": "@functools.cache\ndef items(n): return [n]\ndef f(x):\n    return sum(len(items(n)) for n in range(1500))",
     "objects of the call": "class C:\n    def __init__(self): self.n = 0\n    def add(self, x): self.n += x\ndef f(x):\n    c = C()\n    c.add(x)\n    return c.n",
     "a change that is undone": "L = [1]\ndef f(x):\n    L.append(x)\n    return L.pop()",
@@ -292,6 +293,21 @@ def test_a_cache_that_the_promotion_alone_fills_and_changes_is_found_by_the_repl
     runner.run(x=1)
     with pytest.raises(PromotionRefused, match="Function 'use' changed 'table', which outlives the call"):
         ep.promote(runner, tmp_path / "b")
+
+
+def test_a_memo_that_no_name_of_the_module_has_keeps_its_numbers_warm(tmp_path):
+    source = """
+    class C:
+        @staticmethod
+        @functools.cache
+        def squared(n):
+            return n * n, n
+    def f(x):
+        return C.squared(3)[0]
+    """
+    runner = ep.load(bundle(tmp_path / "b", source))
+    assert [runner.run(x=x)["y"] for x in range(5)] == [9] * 5
+    assert runner.cg.functions["f"].__globals__["C"].squared.cache_info()[:2] == (4, 1)
 
 
 def test_functions_that_reach_nothing_that_can_change_are_called_as_they_are(tmp_path):

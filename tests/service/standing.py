@@ -8,7 +8,7 @@ import threading
 import uuid
 from contextlib import contextmanager
 
-from epypes.bundle.hyperparameters import written
+from epypes.bundle.settings import written
 from epypes.catalog import plain
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.view import view

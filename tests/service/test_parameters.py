@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from epypes.bundle.hyperparameters import Member, read
-from epypes.bundle.settings import read_settings
+from epypes.bundle.settings import Member, read, read_settings
 from epypes.errors import BundleError
 from epypes.service.parameters import changed_entries, entries_of, misfits, type_of, value_of
 

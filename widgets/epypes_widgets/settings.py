@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.hyperparameters import fits, read, written
+from epypes.bundle.settings import fits, read, written
 from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
 from epypes.graph import CompGraph, annotated_params

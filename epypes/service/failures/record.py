@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from time import time_ns
 from typing import Any, Final
 
-from epypes.bundle.hyperparameters import StoredArray, read
+from epypes.bundle.settings import StoredArray, read
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote
 
 from epypes.bundle.adapters import in_order
-from epypes.bundle.hyperparameters import written
+from epypes.bundle.settings import written
 from epypes.bundle.writeback import WriteBack
 from epypes.catalog import plain
 from epypes.errors import EpypesError, ServiceError

@@ -11,7 +11,7 @@ from types import GenericAlias
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 from epypes.bundle.adapters import in_order
-from epypes.bundle.hyperparameters import read
+from epypes.bundle.settings import read
 from epypes.catalog import plain
 from epypes.errors import EpypesError, RemoteFailure, ServiceError
 from epypes.graph import CompGraph, colour_order, subgraph
