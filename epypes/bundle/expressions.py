@@ -10,6 +10,7 @@ import ast
 import dataclasses
 import enum
 import itertools
+import json
 import keyword
 import logging
 import pathlib
@@ -17,7 +18,7 @@ import re
 import sys
 import types
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from decimal import Decimal
@@ -79,6 +80,11 @@ def is_data(value: object) -> bool:
     """Whether a value is of a type that literals are made of."""
     kinds = (bool, int, float, complex, str, bytes, type(None), tuple, list, dict, set, frozenset)
     return type(value) in kinds
+
+
+def escaped(text: str, most: int = 200) -> str:
+    """Return text as it may stand in a comment or docstring, whatever it holds: names are data."""
+    return json.dumps(text if len(text) <= most else f"{text[: most - 3]}...")[1:-1]
 
 
 def quoted(text: str | bytes) -> str:
@@ -172,7 +178,7 @@ def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
     what
         How to call it in a reason.
     wanted
-        The name of a function that has none of its own.
+        The name of a function that has none of its own, or of an array that is stored in a file.
 
     Raises
     ------
@@ -220,7 +226,7 @@ class _Writer:
         source = literal_source(value)
         if source:
             return source
-        if type(value) in (tuple, list, dict, set):
+        if type(value) in (tuple, list, dict):
             return bracketed(value, self.write)
         made_by, arguments = _call_of(value)
         if made_by is not None:
@@ -279,9 +285,9 @@ class _Writer:
     def _array(self, array: Any) -> str:
         """Return the expression of an array: its numbers if they are few, else the call that reads it from a file."""
         text = self._numbers(array)
-        if (text and len(text) <= _MOST_CHARACTERS) or not self.gathered.arrays.has_folder:
+        if (text and len(text) <= _MOST_CHARACTERS) or not self.gathered.stores_arrays:
             return text
-        return self.gathered.arrays.add(self.gathered, array, self.what) if array.dtype.kind in "biufc" else ""
+        return _stored(self.gathered, array, self.what, self.wanted) if array.dtype.kind in "biufc" else ""
 
     def _numbers(self, array: Any) -> str:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
@@ -346,46 +352,34 @@ _TEXT: Final = '''def {reader}(name):
     return array'''
 
 
-class Arrays:
-    """The arrays that a module has from files, by name.
+def array_reader(gathered: Slice) -> str:
+    """Return the function that reads the arrays that a module has from files; "" if there are none."""
+    if not gathered.arrays:
+        return ""
+    numpy, pathlib = (gathered.module_name(module, READER) for module in ("numpy", "pathlib"))
+    return _TEXT.format(reader=READER, numpy=numpy, pathlib=pathlib, folder=ARRAYS)
 
-    Parameters
-    ----------
-    has_folder
-        Whether there is a folder for them. Without, there is only text.
-    """
 
-    def __init__(self, has_folder: bool) -> None:
-        self.by_name: dict[str, Any] = {}
-        self.has_folder = has_folder
-
-    def reader(self, gathered: Slice) -> str:
-        """Return the function that reads the arrays; "" if there are none."""
-        if not self.by_name:
-            return ""
-        numpy, pathlib = (gathered.module_name(module, READER) for module in ("numpy", "pathlib"))
-        return _TEXT.format(reader=READER, numpy=numpy, pathlib=pathlib, folder=ARRAYS)
-
-    def add(self, gathered: Slice, array: Any, what: str) -> str:
-        """Store an array of numbers as a file; return the call that reads it."""
-        known = next((name for name, other in self.by_name.items() if other is array), "")
-        if known:
-            return f'{READER}("{known}")'
-        size = sum(other.nbytes for other in self.by_name.values()) + array.nbytes
-        if size > MOST_BYTES:
-            raise Refused(
-                f"{what} uses an array, with which the bundle's arrays have {size / 1e6:.1f} MB; {MOST_BYTES / 1e6:g} "
-                "MB are the most. Pass it in as a token, or put it into the data of a package that is installed and "
-                "read it with importlib.resources."
-            )
-        if not self.by_name:
-            gathered.reserve(READER)
-        name = identifier_of(_name_in({**gathered.captured, **gathered.read}, array), self.by_name.__contains__)
-        self.by_name[name] = array
-        # What the function that reads them needs is known before the imports are written.
-        for module in ("numpy", "pathlib"):
-            gathered.module_name(module, what)
-        return f'{READER}("{name}")'
+def _stored(gathered: Slice, array: Any, what: str, wanted: str) -> str:
+    """Store an array of numbers as a file; return the call that reads it."""
+    known = next((name for name, other in gathered.arrays.items() if other is array), "")
+    if known:
+        return f'{READER}("{known}")'
+    size = sum(other.nbytes for other in gathered.arrays.values()) + array.nbytes
+    if size > MOST_BYTES:
+        raise Refused(
+            f"{what} uses an array, with which the bundle's arrays have {size / 1e6:.1f} MB; {MOST_BYTES / 1e6:g} "
+            "MB are the most. Pass it in as a token, or put it into the data of a package that is installed and "
+            "read it with importlib.resources."
+        )
+    if not gathered.arrays:
+        gathered.reserve(READER)
+    name = identifier_of(wanted or "array", gathered.arrays.__contains__)
+    gathered.arrays[name] = array
+    # What the function that reads them needs is known before the imports are written.
+    for module in ("numpy", "pathlib"):
+        gathered.module_name(module, what)
+    return f'{READER}("{name}")'
 
 
 def write_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
@@ -397,21 +391,6 @@ def write_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
     for name, array in arrays.items():
         (folder / ARRAYS).mkdir(exist_ok=True)
         np.save(folder / ARRAYS / f"{name}.npy", array, allow_pickle=False)
-
-
-def _name_in(names: Mapping[str, Any], array: Any) -> str:
-    """Return what the notebook calls an array: a variable, or one with the key or number under which it is in it."""
-    paths = (path for name, value in sorted(names.items()) for path in _paths(value, array, name, 5))
-    return min(paths, key=len, default="array")
-
-
-def _paths(value: Any, array: Any, path: str, depth: int) -> Iterator[str]:
-    if value is array:
-        yield path
-    elif depth and type(value) in (dict, list, tuple):
-        parts = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, part in parts:
-            yield from _paths(part, array, f"{path}_{key}", depth - 1)
 
 
 # -- line breaks -------------------------------------------------------------------------------------------------------

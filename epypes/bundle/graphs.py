@@ -10,7 +10,16 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from epypes.bundle.definitions import functions_of
-from epypes.bundle.expressions import UNKNOWN, Item, expression_or_none, is_same_data, laid_out, one_per_line, quoted
+from epypes.bundle.expressions import (
+    UNKNOWN,
+    Item,
+    escaped,
+    expression_or_none,
+    is_same_data,
+    laid_out,
+    one_per_line,
+    quoted,
+)
 from epypes.bundle.notebook_source import nested_codes
 from epypes.bundle.resolve import Refused
 from epypes.bundle.slice import Slice
@@ -91,7 +100,8 @@ class Graphs:
             what = f"Function {name!r}{where}"
             switch = as_switch(function)
             if switch is not None:
-                switches[name] = references[name] = self._switch(cg, name, switch, what)
+                with self.gathered.noted_refusals():
+                    switches[name] = references[name] = self._switch(cg, name, switch, what)
             elif is_placeholder(function):
                 way_out = f"Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
                 self.gathered.refusals.append(f"{what} is a placeholder. {way_out}")
@@ -118,8 +128,8 @@ class Graphs:
         branches = ", ".join(f"{key}: {quoted(token)}" for key, token in zip(keys, tokens, strict=True))
         variable = self.gathered.free_name(name)
         arguments = f"{quoted(name)}, {{{branches}}}, by={quoted(by)}, output={quoted(output)}"
-        made = f"{self._epypes(what)}.switch({arguments})"
-        comment = f"# Only the branch that {_printable(by)} chooses is computed."
+        made = f"{self.gathered.module_name('epypes', what)}.switch({arguments})"
+        comment = f"# Only the branch that {escaped(by, 80)} chooses is computed."
         self.blocks.append([comment, *laid_out(made, before=f"{variable} = ")])
         return variable
 
@@ -127,7 +137,7 @@ class Graphs:
         """Write an object of a class of nodes or pipelines; return its variable."""
         kind, given = type(made), arguments_of(made, what)
         if kind is Pipeline:
-            known = f"{self._epypes(what)}.Pipeline"
+            known = f"{self.gathered.module_name('epypes', what)}.Pipeline"
         else:
             known = self.gathered.add_class(kind, f"Class {kind.__name__!r}{_inside(what)}")
         arguments, lines = list[str](), list[str]()
@@ -146,28 +156,17 @@ class Graphs:
         text = self.write(cg, _inside(what))
         functions, io = self.gathered.free_name(f"{name}_functions"), self.gathered.free_name(f"{name}_io")
         ends = f"{', '.join(cg.source_tokens) or 'nothing'} -> {', '.join(cg.sink_tokens) or 'nothing'}"
-        lines = [f"# {_printable(f'A graph of its own: {ends}.')}", *text.functions(functions), *text.io(io, cg)]
-        epypes = self._epypes(what)
+        lines = [f"# {escaped(f'A graph of its own: {ends}.', 80)}", *text.functions(functions), *text.io(io, cg)]
+        epypes = self.gathered.module_name("epypes", what)
         source = f"{epypes}.CompGraph({functions}, {io}{'' if cg.types else ', types=False'})"
         for name, members in cg.groups.items():
             source = f"{epypes}.group({source}, {quoted(name)}, functions=[{', '.join(map(quoted, members))}])"
         return source, lines
 
-    def _epypes(self, what: str) -> str:
-        with self.gathered.noted_refusals():
-            return self.gathered.module_name("epypes", what)
-        return "epypes"
-
 
 def _inside(what: str) -> str:
     """Return what stands behind the name of something that is part of a function."""
     return f" of {what[0].lower()}{what[1:]}"
-
-
-def _printable(text: str) -> str:
-    """Return text as it may stand in a comment, whatever it holds."""
-    shown = "".join(character if character.isprintable() else "?" for character in text)
-    return shown if len(shown) <= 80 else f"{shown[:77]}..."
 
 
 # -- the arguments that a node or pipeline was made with -------------------------------------------------------------

@@ -6,14 +6,13 @@ import ast
 import enum
 import functools
 import itertools
-import json
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import LINE, expression, laid_out, one_per_line, quoted
+from epypes.bundle.expressions import LINE, array_reader, escaped, expression, laid_out, one_per_line, quoted
 from epypes.bundle.graphs import Graphs, GraphText, arguments_of, parameters_of
 from epypes.bundle.load import MAKER
 from epypes.bundle.notebook_source import Position, parsed
@@ -59,7 +58,7 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
     settings = replace(settings, own=tuple(own))
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))
-    arrays = gathered.arrays.by_name
+    arrays = gathered.arrays
     module = emit_module(settings, subject.cg, gathered, text, graphs.blocks, [*filter(None, own.values()), *enums])
     why, _ = refusal(module, arrays, functools.partial(_pairs, subject, settings))
     return module, settings, arrays, [why] if why else []
@@ -149,18 +148,13 @@ def _spaced(blocks: Sequence[str]) -> str:
 def _docstring(settings: Settings) -> str:
     """Return the module's docstring, which names the graph and how to run it."""
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
-    title = _escaped(f"The computational graph {settings.name}: {ends}.")
+    title = escaped(f"The computational graph {settings.name}: {ends}.")
     if len(title) > LINE - 3:
-        title = _escaped(f"The computational graph {settings.name}.")
+        title = escaped(f"The computational graph {settings.name}.")
     run = f"    runner.{run_call(settings.inputs)}"
     if not all(token.isidentifier() for token in settings.inputs) or len(run) > LINE:
         run = "    runner.run(**payload)"
-    return _TEXT.format(title=title, run=_escaped(run))
-
-
-def _escaped(text: str) -> str:
-    """Return text as it may stand between triple quotes: names are data, whatever they hold."""
-    return json.dumps(text)[1:-1]
+    return _TEXT.format(title=title, run=escaped(run))
 
 
 # -- what a bundle has of its own -------------------------------------------------------------------------------------
@@ -318,7 +312,7 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
             texts[name] = "\n".join(known.lines)
         else:
             early += [*[""][: bool(early) and known.lines[0].startswith("#")], *known.lines]
-    reader = needed.arrays.reader(needed)
+    reader = array_reader(needed)
     imports = [_import_lines(needed.imports.values())] if needed.imports else []
     constants = ["\n".join(early)] if early else []
     sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]

@@ -321,7 +321,7 @@ def inside_function(head: str, text: str, returned: str) -> str:
     inside = set(_lines_in_strings(text))
     lines = enumerate(io.StringIO(text).readlines(), 1)
     body = "".join(line if number in inside or not line.strip() else f"    {line}" for number, line in lines)
-    return f"{head}\n{body}    return {returned}\n"
+    return f"{head}\n{body}\n    return {returned}\n"
 
 
 def comment_above(lines: Sequence[str], number: int) -> list[str]:

@@ -20,7 +20,6 @@ from epypes.bundle.definitions import Definition, annotated_names, class_definit
 from epypes.bundle.expressions import (
     LINE,
     UNKNOWN,
-    Arrays,
     expression,
     identifier_of,
     is_data,
@@ -66,7 +65,6 @@ def gather(
     write(survey)
     gathered = Slice(reserved, stores_arrays=stores_arrays)
     gathered.read.update(survey.read)
-    gathered.captured.update(survey.captured)
     return gathered, write(gathered)
 
 
@@ -82,8 +80,10 @@ class Slice:
 
     Attributes
     ----------
-    read, captured
-        What functions read by name, and what closures have captured: the former names are theirs alone.
+    read
+        What functions read by name: these names are theirs alone.
+    arrays
+        The arrays that are stored in files, by name.
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
@@ -101,9 +101,9 @@ class Slice:
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
-        self.arrays = Arrays(stores_arrays)
+        self.stores_arrays = stores_arrays
+        self.arrays: dict[str, Any] = {}
         self.read: dict[str, object] = {}
-        self.captured: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, Constant] = {}
         self.definitions: dict[str, str] = {}
@@ -172,9 +172,6 @@ class Slice:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
         check_home(home, what)
         top = home.qualname.partition(".")[0]
-        known = [name for name, imported in self.imports if imported == f"{home.module}.{top}"]
-        if known:
-            return min(known) + home.qualname.removeprefix(top)
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
             return home.qualname
@@ -311,8 +308,6 @@ class Slice:
 
     def _argument(self, value: Any, what: str, name: str = "") -> str:
         """Return the expression of what a partial was given, or what a closure has captured."""
-        if name:
-            self.captured[name] = value
         inner = f"A function that {what[0].lower()}{what[1:]} has" if callable(value) else what
         source = expression(self, value, inner, name)
         if not source or not (is_short(source) or callable(value)):
@@ -358,7 +353,7 @@ class Slice:
         elif callable(value):
             source = expression(self, value, f"Function {name!r}, {around} calls,", name)
         else:
-            source = expression(self, value, f"{what}, by {name!r} ({found.place_of(name)}),")
+            source = expression(self, value, f"{what}, by {name!r} ({found.place_of(name)}),", name)
         if not source or not (is_short(source) or callable(value)):
             shared = _home_of_data(value)
             if shared is None:

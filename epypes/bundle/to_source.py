@@ -13,13 +13,13 @@ from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import (
     LINE,
     Item,
+    escaped,
     expression_or_none,
     identifiers_of,
     is_identifier,
     laid_out,
     literal_source,
     one_per_line,
-    quoted,
 )
 from epypes.bundle.module import module_text
 from epypes.bundle.slice import Slice, gather
@@ -30,7 +30,6 @@ from epypes.run import CompGraphRunner
 
 # Python itself can't indent deeper than 100; half of that can't be read.
 _DEEPEST: Final = 20
-_SHOWN: Final = 40
 _NO_EXPRESSION: Final = "is of type {kind}, and no expression makes it again. Write a plain function (def)."
 _NO_VALUE: Final = (
     "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
@@ -313,14 +312,8 @@ class _Part:
         other = [token for token in dict.fromkeys(shown) if self.variables[token] != token]
         if not other:
             return [f'    """{summary}"""']
-        lines = [f"        {self.variables[token]}: {_printable(token)}" for token in other]
+        lines = [f"        {self.variables[token]}: '{escaped(token, 40)}'" for token in other]
         return [f'    """{summary}', "", "    Tokens of the graph that have other names here:", "", *lines, '    """']
-
-
-def _printable(token: str) -> str:
-    """Return a token as it may stand in a docstring, whatever it holds."""
-    plain = "".join(character if character.isprintable() and character not in '\\"' else "?" for character in token)
-    return quoted(plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}...").replace('"', "'")
 
 
 def _branches(cg: CompGraph, name: str, around: _Region) -> list[_Region]:

@@ -221,7 +221,7 @@ def test_what_the_module_would_not_have_is_refused(monkeypatch, tmp_path, cell, 
 def test_a_closure_is_written_with_what_it_has_captured_whatever_its_factory_makes_by_now(monkeypatch):
     text = ep.to_source(runner_of(monkeypatch, FACTORY))
     assert text.startswith(
-        "def make(k, w):\n    def f(a):\n        return a * w + k\n    return f\n\n\nf = make(k=3, w=6)\n"
+        "def make(k, w):\n    def f(a):\n        return a * w + k\n\n    return f\n\n\nf = make(k=3, w=6)\n"
     )
     assert ep.to_source(runner_of(monkeypatch, FACTORY, "GAIN = 9")) == text
 

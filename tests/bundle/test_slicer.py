@@ -95,7 +95,10 @@ SLICED = {
         "import types\nm = types.ModuleType('m')\nm.k = 1\ndef f(x, k=m.k):\n    return x + k\nm.k = 2\n",
         4,
     ),
-    "list of a module as default": ("import sys\ndef f(x, k=sys.argv):\n    return x + isinstance(k, list)\n", 4),
+    "list of a module as default": (
+        "import keyword\ndef f(x, k=keyword.softkwlist):\n    return x + isinstance(k, list)\n",
+        4,
+    ),
     "type as default": ("def f(x, kind=np.uint8):\n    return kind(x).itemsize\n", 1),
     "unguarded": ("@ep.unguarded\ndef f(x):\n    return x\n", 3),
     "redefinition": ("def f(x):\n    return 0\ndef f(x):\n    return x\n", 3),
@@ -261,7 +264,7 @@ def f(im):
         "\n\nimport functools\n\nLOW = 0.5\nSIZE = 0x10  # of the window\nLIMIT = 3  # sum([1, 2]) in the notebook\n"
         "STEP = 3  # the second\nWEIGHTS = (1, 2,\n           3)\noffset = functools.partial(max, 3, key=abs)",
         "def blurred(im):\n    return smooth(im) + offset(im)",
-        "def make_smooth(k, sigma):\n    def smooth(im):\n        return im * k + sigma\n    return smooth",
+        "def make_smooth(k, sigma):\n    def smooth(im):\n        return im * k + sigma\n\n    return smooth",
         "smooth = make_smooth(k=5, sigma=0)",
         'by_name = {"smooth": smooth}',
         'def f(im):\n    return by_name["smooth"](im) + blurred(im) + LOW + SIZE + LIMIT + STEP + WEIGHTS[2]',
