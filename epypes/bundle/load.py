@@ -84,17 +84,19 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         before = _identity(folder)
         try:
             digest = check_manifest(folder) if compare else ""
-            for file in bundle_files(folder):
+            files = bundle_files(folder)
+            if MODULE not in files:
+                raise BundleError(folder, f"{folder} has no {MODULE}. Promote the graph again.")
+            for file in files:
                 if file.endswith(".npy"):
                     load_array(folder / file, "r")
-            content, source = (folder / SETTINGS).read_bytes(), (folder / MODULE).read_bytes()
-            settings = read_settings(folder / SETTINGS, content=content)
-            stored = {
-                token: load_array(folder / value.file)
+            module = execute(folder / MODULE, (folder / MODULE).read_bytes())
+            enums = getattr(module, "enums", {})
+            settings = read_settings(folder / SETTINGS, enums)
+            values = {
+                token: load_array(folder / value.file) if type(value) is StoredArray else value
                 for token, value in settings.hyperparameters.items()
-                if type(value) is StoredArray
             }
-            module = execute(folder / MODULE, source)
         except Exception:  # whatever the module's own code raises
             if _identity(folder) == before:
                 raise
@@ -103,9 +105,6 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         if _identity(folder) == before:
             break
     try:
-        enums = getattr(module, "enums", {})
-        settings = read_settings(folder / SETTINGS, enums, content)
-        settings = replace(settings, hyperparameters={**settings.hyperparameters, **stored})
         own = {name: getattr(module, name) for name in settings.own}
         check_caches(vars(module))
         ports = {name: port for name, port in own.items() if name != MAKER}
@@ -116,7 +115,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         missing = repr(error.name) if isinstance(error, AttributeError) else error
         text = f"{folder / MODULE} has no {missing} that {SETTINGS} names. Promote the graph again."
         raise BundleError(folder, text) from error
-    return Bundle(folder, cg, settings, digest, own, enums)
+    return Bundle(folder, cg, replace(settings, hyperparameters=values), digest, own, enums)
 
 
 def _graph(module: Any, functions: Mapping[str, Callable[..., Any]], settings: Settings) -> CompGraph:

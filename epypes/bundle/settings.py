@@ -237,7 +237,7 @@ def _item(part: Any) -> Any:
     return item.multiline(True) if has_rows or len(item.as_string()) > _LINE else item
 
 
-def read_settings(path: Path, enums: Mapping[str, Any] | None = None, content: bytes | None = None) -> Settings:
+def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Settings:
     """Read pipeline.toml.
 
     Parameters
@@ -246,8 +246,6 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None, content: b
         The file.
     enums
         The enumerations of the bundle's module by name. Without, members of them are read as :class:`Member`.
-    content
-        What stands in the file, where it is known.
 
     Raises
     ------
@@ -255,7 +253,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None, content: b
         It is not TOML, has another format, or lacks an entry; the entry is named.
     """
     try:
-        document = tomllib.loads((path.read_bytes() if content is None else content).decode())
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
         bundle, ports = document["bundle"], document["ports"]
         if bundle["format"] != FORMAT:
             raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")

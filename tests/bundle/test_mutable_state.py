@@ -389,19 +389,30 @@ def test_events_of_a_pipeline_fail_and_the_next_ones_do_not_depend_on_them(tmp_p
     assert all(isinstance(failure.exception, StateChanged) for failure in found)
 
 
-def test_runs_in_threads_do_not_see_each_others_changes(tmp_path):
-    source = """
-    import time
-    L = []
-    def f(x):
-        if x > 100: L.append(x)
-        time.sleep(0.0005)
-        return len(L)
-    """
+@pytest.mark.parametrize(
+    "items",
+    [
+        "L = []\ndef items(): return L",
+        "@functools.cache\ndef items(): return []",
+        "class C:\n    @staticmethod\n    @functools.cache\n    def items(): return []\nitems = lambda: C.items()",
+    ],
+    ids=["a list", "a cache", "a cache that no name of the module has"],
+)
+def test_runs_in_threads_do_not_see_each_others_changes(items, tmp_path):
+    source = f"""
+import time
+{items}
+def f(x):
+    found = items()
+    if x > 100: found.append(x)
+    time.sleep(0.0005)
+    return len(found)
+"""
     runner = ep.load(bundle(tmp_path / "b", source))
     with ThreadPoolExecutor(8) as pool:
         answers = [*pool.map(lambda x: answer(runner, x), [1, 200] * 40)]
-    assert answers == ["0", "StateChanged"] * 40
+    assert answers[::2] == ["0"] * 40
+    assert {*answers[1::2]} <= {"StateChanged", "1"}
 
 
 def test_calls_that_change_nothing_run_at_the_same_time(tmp_path):

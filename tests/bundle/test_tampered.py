@@ -142,6 +142,15 @@ def test_a_fifo_a_device_link_or_a_socket_in_a_bundle_is_refused_by_all_that_rea
             use()
 
 
+@pytest.mark.parametrize("name", ["pipeline.py", "pipeline.toml"])
+def test_a_bundle_whose_manifest_covers_only_a_part_is_refused(folder, name):
+    (folder / name).unlink()
+    write_manifest(folder)
+    for use in (ep.load, verify):
+        with pytest.raises(BundleError, match=name):
+            use(folder)
+
+
 @pytest.mark.parametrize("put", [fifo, endless, elsewhere])
 def test_a_manifest_that_is_no_regular_file_is_refused(folder, tmp_path, put):
     *uses, unsealed, promoting = readers(folder)
