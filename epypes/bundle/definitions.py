@@ -162,8 +162,8 @@ def _of_text(function: types.FunctionType, what: str, decorators: Collection[ast
     check_nonlocal(function, node, what)
     captured = captured_by(function)
     names = {**function.__globals__, **captured} if captured else function.__globals__
-    whole = _compiled(text, what, place)
-    return Definition(node.name, text, node, whole, code.co_filename, code.co_firstlineno, names, function, captured)
+    compiled = _compiled(text, what, place)
+    return Definition(node.name, text, node, compiled, code.co_filename, code.co_firstlineno, names, function, captured)
 
 
 def _compiled(text: str, what: str, place: str) -> types.CodeType:
@@ -297,7 +297,7 @@ def statements_of_class(kind: type) -> Iterator[tuple[str, ast.ClassDef]]:
     """
     own = dict.fromkeys(function.__code__.co_filename for function in functions_of(kind).values())
     main = vars(sys.modules["__main__"])
-    files = [*own] or [str(main.get("__file__", "")), *linecache.cache]
+    files = [*own] or [*linecache.cache, str(main.get("__file__", ""))]
     for file in sorted(files, key=lambda file: cell_of(file, main))[::-1]:
         text = "".join(lines_in(file))
         tree = parsed(text) if f"class {kind.__name__}" in text else None

@@ -204,6 +204,11 @@ def expression_or_none(gathered: Slice, value: Any, what: str, reason: str = "",
     return "None"
 
 
+def names_in(source: str) -> set[str]:
+    """Return the names that an expression reads."""
+    return {node.id for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Name)}
+
+
 def is_short(source: str) -> bool:
     """Whether an expression is one that people still read; arrays in it are short enough by themselves."""
     return len(_ARRAY.sub("", source)) <= _MOST_CHARACTERS

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import LINE, array_reader, escaped, expression, laid_out, one_per_line, quoted
+from epypes.bundle.expressions import LINE, array_reader, escaped, expression, laid_out, names_in, one_per_line, quoted
 from epypes.bundle.graphs import Graphs, GraphText, arguments_of, parameters_of
 from epypes.bundle.load import MAKER
 from epypes.bundle.notebook_source import Position, parsed
@@ -308,7 +308,7 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
     positions = needed.positions | {name: one.position for name, one in needed.constants.items() if one.position}
     early: list[str] = []
     for name, known in sorted(needed.constants.items(), key=lambda item: (not item[1].position, item[1].position)):
-        if _names(ast.walk(ast.parse(known.source))) & needed.definitions.keys():
+        if names_in(known.source) & needed.definitions.keys():
             texts[name] = "\n".join(known.lines)
         else:
             early += [*[""][: bool(early) and known.lines[0].startswith("#")], *known.lines]

@@ -29,6 +29,7 @@ from epypes.bundle.expressions import (
     laid_out,
     literal_source,
     literal_value,
+    names_in,
 )
 from epypes.bundle.notebook_source import (
     Position,
@@ -254,11 +255,10 @@ class Slice:
         code = code_on_its_own(with_defaults(found.text, dict.fromkeys(changed, "None")))
         found = replace(found, code=code or found.code)
         own = next((each for each, value in found.captured.items() if value is function), "")
-        given = {
-            each: self._argument(value, what, each)
-            for each, value in found.captured.items()
-            if each != own and id(value) not in self._unfinished  # closures that need each other do so by a global name
-        }
+        given = {each: self._argument(value, what, each) for each, value in found.captured.items() if each != own}
+        # What needs a closure that is not written yet is read by a global name, which may be given its value later.
+        unfinished = {self._known[known] for known in self._unfinished}
+        given = {each: source for each, source in given.items() if not names_in(source) & unfinished}
         if given or own not in ("", name):
             inner = own or found.name
             self._write_closure(name, renamed(text, found.name, inner), inner, given, found, what)
@@ -272,7 +272,8 @@ class Slice:
     ) -> None:
         """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
         whole = inside_function(f"({', '.join(given)}):", text, inner)
-        around = found.function.__code__.co_qualname.split(".<locals>.")[-2] if found.function else name
+        qualname = found.function.__code__.co_qualname if found.function else ""
+        around = qualname.rpartition(".<locals>")[0].rpartition(".")[2] or f"make_{inner}"
         key = (around, whole)
         if key not in self._makers:
             self._makers[key] = factory = identifier_of(around, self.is_taken)

@@ -74,6 +74,16 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
         "def sized(a):\n    return even_size(a.size)",
         {"sized": "sized"},
     ),
+    "closure that finds itself in a table": (
+        "def make_factorial():\n    steps = {}\n    def factorial(n):\n        return 1 if n < 1 else n * steps['down'](n - 1)\n"
+        "    steps['down'] = factorial\n    return factorial\nfactorial = make_factorial()\ndef factorials(a):\n    return factorial(int(a.max()))",
+        {"factorials": "factorials"},
+    ),
+    "method that calls the one of the class above": (
+        "class Plain:\n    def of(self, a):\n        return a\nclass Raised(Plain):\n    def of(self, a):\n        return super().of(a) + 1\n"
+        "raised_of = Raised.of\ndef raised(a):\n    return raised_of(Raised(), a)",
+        {"raised": "raised"},
+    ),
     "closure that a decorator of a library wraps": (
         "def make_cached(k):\n    @functools.lru_cache\n    def times(n):\n        return n * k if n else times(1)\n    return times\n"
         "by_3, by_4 = make_cached(3), make_cached(4)\ndef cached_times(a):\n    return by_3(int(a.max())) + by_4(0)",
