@@ -27,7 +27,7 @@ import types
 import warnings
 import weakref
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -80,7 +80,6 @@ class _Path:
     root: str
     owner: str
     part: str = ""
-    closure: int = 0
 
     def to(self, more: str) -> _Path:
         return dataclasses.replace(self, part=self.part + more)
@@ -99,18 +98,12 @@ class _Different(Exception):
 
     def __init__(self, path: _Path, text: str) -> None:
         super().__init__(f"{path}: {text}")
-        self.closure = path.closure
 
 
 Pair = tuple[str, Any, Any]
 
 
-def refusal(
-    text: str,
-    arrays: Mapping[str, Any],
-    pairs: Callable[[Any], Iterable[Pair]],
-    called: Mapping[int, str] | None = None,
-) -> tuple[str, int]:
+def refusal(text: str, arrays: Mapping[str, Any], pairs: Callable[[Any], Iterable[Pair]]) -> str:
     """Execute a module that was emitted, and return why its objects are not the notebook's; "" if they are.
 
     Parameters
@@ -121,50 +114,39 @@ def refusal(
         What it reads from files, by name.
     pairs
         Returns of the module what is compared: how a reason calls an object, the notebook's object and the module's.
-    called
-        The names of closures that the module makes by a call of their factory, by id of the notebook's closure.
-
-    Returns
-    -------
-    tuple
-        The reason, and the id of the closure whose factory makes another one by now, 0 if it is something else.
     """
-    known = called or {}
     with tempfile.TemporaryDirectory(prefix=_DRAFT) as folder:
         path = Path(folder) / MODULE
         path.write_text(text, encoding="utf-8")
         write_arrays(path.parent, arrays)
         try:
-            return _refusal(path, pairs, known)
+            return _refusal(path, pairs)
         finally:
             linecache.cache.pop(str(path), None)
 
 
-def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]], called: Mapping[int, str]) -> tuple[str, int]:
+def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]]) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the notebook has shown them
             module = execute(path, path.read_bytes())
     except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        line = str(frames[0].line) if frames else ""
-        closure = next((one for one, name in called.items() if line.startswith(f"{name} = ")), 0)
-        where = f", at {line!r}" if line else ""
-        return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}", closure
-    walk = _Walk(called)
+        where = f", at {str(frames[0].line)!r}" if frames else ""
+        return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}"
+    walk = _Walk()
     walk.waiting.extend((_Path(what, _placed(what, ours)), ours, theirs) for what, ours, theirs in pairs(module))
     try:
         walk.finish()
     except _Different as found:
-        return f"{found} {_WAY_OUT}", found.closure
-    return "", 0
+        return f"{found} {_WAY_OUT}"
+    return ""
 
 
 class _Walk:
     """A walk over two graphs of objects that compares each pair of objects once."""
 
-    def __init__(self, called: Collection[int]) -> None:
-        self._called = called
+    def __init__(self) -> None:
         self.waiting: deque[tuple[_Path, Any, Any]] = deque()
         # The objects by their ids. They are kept here, so that no id is used again.
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
@@ -177,8 +159,6 @@ class _Walk:
         while self.waiting:
             path, ours, theirs = self.waiting.popleft()
             ours, theirs = _bare(ours), _bare(theirs)
-            if id(ours) in self._called:
-                path = dataclasses.replace(path, closure=id(ours))
             self._compare_identity(path, ours, theirs)
             if ours is not theirs and (id(ours), id(theirs)) not in self._seen:
                 self._seen[id(ours), id(theirs)] = ours, theirs
@@ -248,7 +228,7 @@ class _Walk:
         if ours.__code__ is not theirs.__code__:
             node = _node(ours.__code__)
             owner = _placed(f"Function {ours.__name__!r}", ours) if path.part else path.owner
-            path = _Path(path.root, owner, closure=path.closure)
+            path = _Path(path.root, owner)
             if not _is_same_text(ours.__code__, theirs.__code__, node):
                 raise _Different(path, "the notebook has it with another text than the cells have now.")
             parts = [*ast.walk(node)] if node is not None else []
@@ -269,7 +249,7 @@ class _Walk:
     def _compare_classes(self, path: _Path, ours: type, theirs: type) -> None:
         if not _is_of_notebook(ours) or ours.__name__ != theirs.__name__:
             raise _unlike(path, ours, theirs)
-        path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours), closure=path.closure)
+        path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours))
         self._add(path.to(" metaclass"), type(ours), type(theirs))
         self._add(path.to(" bases"), ours.__bases__, theirs.__bases__)
         self._add(path.to(" options"), _options(ours), _options(theirs))
@@ -370,10 +350,12 @@ def _marks(function: Any) -> dict[str, Any]:
     found = {name: value for name, value in vars(function).items() if not name.startswith("__epypes_")}
     names = sorted(found.keys() - set(functools.WRAPPER_ASSIGNMENTS))
     if isinstance(function, types.FunctionType) and "__wrapped__" not in found:
-        # The module may have it under another name; a name that was set later is of another kind.
-        found["__name__"] = function.__name__ == function.__code__.co_name or function.__name__
         found["__doc__"] = function.__doc__
-        names += "__name__", "__doc__"
+        names.append("__doc__")
+        # The module may have it under another name, unlike one that was set later.
+        if function.__name__ != function.__code__.co_name:
+            found["__name__"] = function.__name__
+            names.append("__name__")
     return {f" attribute {name!r}": found[name] for name in names}
 
 

@@ -60,7 +60,7 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))
     arrays = gathered.arrays
     module = emit_module(settings, subject.cg, gathered, text, graphs.blocks, [*filter(None, own.values()), *enums])
-    why, _ = refusal(module, arrays, functools.partial(_pairs, subject, settings))
+    why = refusal(module, arrays, functools.partial(_pairs, subject, settings))
     return module, settings, arrays, [why] if why else []
 
 

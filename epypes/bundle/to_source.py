@@ -142,7 +142,7 @@ def _difference(text: str, parts: Sequence[_Part]) -> str:
     def pairs(module: Any) -> list[Pair]:
         return [(what, ours, made) for (what, ours, _), made in zip(compared, module.references, strict=True)]
 
-    return refusal(whole, {}, pairs)[0]
+    return refusal(whole, {}, pairs)
 
 
 @dataclass(eq=False, slots=True)
