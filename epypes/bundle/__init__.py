@@ -2,8 +2,8 @@
 
 from epypes.bundle.load import load, load_pipeline
 from epypes.bundle.promote import promote
+from epypes.bundle.replay import verify
 from epypes.bundle.to_source import to_source
-from epypes.bundle.verify import verify
 from epypes.bundle.writeback import WriteBack, write_back
 
 __all__ = ["WriteBack", "load", "load_pipeline", "promote", "to_source", "verify", "write_back"]

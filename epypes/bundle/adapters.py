@@ -1,17 +1,14 @@
 """The adapters of a bundle: an event becomes a payload (f_in), and a run becomes an answer (f_out).
 
-The answers of a user's own f_out are recorded beside the samples, where two runs give the same answer: an Envelope with
-the same parts, or the same bytes. A replay compares them.
+A sample holds the answer of a user's own f_out as one more output, ANSWER: a replay compares it like a token.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.bundle.compare import Difference, difference, differences, first_difference
-from epypes.errors import MessageError
+from epypes.errors import MessageError, StateChanged
 from epypes.pipeline import EventView
 from epypes.pipeline.answering import FOut
 from epypes.pipeline.stamps import Stamps
@@ -19,11 +16,12 @@ from epypes.run import Run
 from epypes.run.guard import is_array
 
 if TYPE_CHECKING:
-    from epypes.bundle.load import Bundle
     from epypes.wire import Envelope
 
 REQUEST: Final = "epypes.request"
 RESULT: Final = "epypes.result"
+# The name of a recorded answer, among the outputs of a sample.
+ANSWER: Final = "the answer of f_out"
 
 
 def payload_of(inputs: Sequence[str], rgb: Collection[str] = ()) -> Callable[[Any], Mapping[str, Any]]:
@@ -109,70 +107,34 @@ def detached(value: Any) -> Any:
     return value
 
 
-ANSWERS: Final = "answers"
-# How a difference of an answer is named, beside those of tokens.
-ANSWER: Final = "the answer of f_out"
-_BYTES: Final = "bytes"
-_Parts = Mapping[str, Any]
-
-
-def record_answer(path: Path, f_out: FOut, name: str, runs: tuple[Run, Run], attributes: _Parts) -> bool:
-    """Write what f_out makes of a run, if it makes the same of another one of the same payload.
+def answer_of(f_out: FOut, name: str, run: Run, attributes: Mapping[str, Any]) -> dict[str, Any] | bytes | None:
+    """Return what a replay compares of the answer that a user's own f_out makes of a run.
 
     Parameters
     ----------
-    path
-        The file.
     f_out
         The user's own.
     name
         The bundle's.
-    runs
-        Two runs of one payload.
+    run
+        The run.
     attributes
         The pipeline's attributes.
+
+    Returns
+    -------
+    dict, bytes or None
+        The parts of an Envelope, or bytes; None for another answer, and where f_out needs the event, which a sample
+        does not have.
     """
-    from epypes.wire.samples import save_sample
-
-    one, other = (_parts(_answer(f_out, name, run, attributes)) for run in runs)
-    if one is None or other is None or first_difference(dict(one), dict(other)) is not None:
-        return False
-    path.parent.mkdir(exist_ok=True)
-    try:
-        save_sample(path, {}, one)
-    except MessageError:  # it has no codec: then it can't be sent either
-        path.unlink(missing_ok=True)
-        return False
-    return True
-
-
-def answer_differences(bundle: Bundle, sample: str, run: Run) -> Iterator[Difference]:
-    """Give what the answer of a bundle's f_out is otherwise than was recorded; nothing if none was."""
-    from epypes.wire.samples import load_sample
-
-    path = bundle.path / ANSWERS / f"{sample}.npz"
-    if "f_out" not in bundle.own or not path.is_file():
-        return
-    _, expected = load_sample(path)
-    got = _parts(_answer(bundle.own["f_out"], bundle.settings.name, run, bundle.settings.attributes))
-    found = difference(sample, ANSWER, differences(expected, None if got is None else dict(got)))
-    if found is not None:
-        yield found
-
-
-def _answer(f_out: FOut, name: str, run: Run, attributes: _Parts) -> Any:
-    """Return what f_out makes of a run; None if it needs the event, which is not known."""
     from epypes.wire import Envelope
 
     try:
-        return f_out(EventView(name, Envelope("epypes.sample", id="sample"), run, attributes, Stamps()))
+        answer = f_out(EventView(name, Envelope("epypes.sample", id="sample"), run, attributes, Stamps()))
+    except StateChanged:
+        raise
     except Exception:  # whatever a user's function does that misses its event
         return None
-
-
-def _parts(answer: Any) -> _Parts | None:
-    from epypes.wire import Envelope
-
     if isinstance(answer, Envelope):
-        return answer.parts
-    return {_BYTES: bytes(answer)} if isinstance(answer, bytes | bytearray | memoryview) else None
+        return dict(answer.parts)
+    return bytes(answer) if isinstance(answer, bytes | bytearray | memoryview) else None

@@ -1,13 +1,18 @@
-"""Comparison of two values, to the last bit or within a tolerance, and the first place where they differ."""
+"""Comparison of two values, to the last bit or within a tolerance, and the first place where they differ.
+
+Noise is floating-point numbers that differ in less than half of their digits, which is what summing in another order
+does. A bundle tolerates noise that its proof has seen, SAFETY times as large. Nothing else is tolerated.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from epypes.optional import optional_import
 from epypes.wire.encoder import set_sort_key
 from epypes.wire.opencv_pandas import FIELDS, is_table, record_fields, record_type, table_parts
 from epypes.wording import counted
@@ -16,10 +21,14 @@ from epypes.wording import counted
 _ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
 # Whose repr says all of it.
 _EXACT: Final = (bool, int, float, complex, str, bytes, bytearray, type(None))
-
-
 # What is left where large numbers of an array cancel each other is a few of the last digits of those.
 FLOOR: Final = 16.0
+# The next run may be further off than the worst of a few; ten times that is far below any change of an algorithm.
+SAFETY: Final = 10.0
+_MEANING: Final = (
+    "Replays of the samples gave other last digits: a replay may differ by {:g} times as",
+    "much, and each number by no more than the relative part of its own magnitude.",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +58,8 @@ class Difference:
         What differs, with the first index and both values.
     index
         The indices and keys that lead to it, and into it: ``[2]['size']``, ``[17, 4]``.
-    expected, got
-        The first values that differ, as text.
-    count, size
-        How many values differ, of how many.
+    count
+        How many values differ.
     largest
         The largest difference; None if they are no numbers.
     relative
@@ -61,19 +68,19 @@ class Difference:
         Whether all that differ are floating-point numbers, in less than half of their digits.
     sample, token
         The names of both; "" where there are none.
+    function
+        The first function that computes something else each time it is called in one process; "" if there is none.
     """
 
     text: str
     index: str = ""
-    expected: str = ""
-    got: str = ""
     count: int = 1
-    size: int = 1
     largest: float | None = None
     relative: float = 0.0
     is_noise: bool = False
     sample: str = ""
     token: str = ""
+    function: str = ""
 
     def __str__(self) -> str:
         return f"sample {self.sample}, token {self.token!r}: {self.text}" if self.token else self.text
@@ -93,7 +100,7 @@ def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, whe
         Values of any type. Objects that neither numpy, OpenCV nor pandas made are compared by their repr, without
         addresses.
     tolerance
-        How far floating-point numbers may be apart.
+        How far floating-point numbers may differ.
     where
         What leads to the values.
     """
@@ -113,26 +120,22 @@ def difference(sample: str, token: str, found: Iterable[Difference]) -> Differen
         return None
     more = len(places) - 1
     others = f"; {counted(more, 'other place')} of it differ{'s' * (more == 1)}" if more else ""
+    count = sum(place.count for place in places)
+    return replace(largest_of(places), text=places[0].text + others, count=count, sample=sample, token=token)
+
+
+def largest_of(found: Sequence[Difference]) -> Difference:
+    """Return the first of some differences, as large as the largest of them."""
     return replace(
-        places[0],
-        text=places[0].text + others,
-        count=sum(place.count for place in places),
-        size=sum(place.size for place in places),
-        largest=max((place.largest for place in places if place.largest is not None), default=None),
-        relative=max(place.relative for place in places),
-        is_noise=is_noise(places),
-        sample=sample,
-        token=token,
+        found[0],
+        largest=max((each.largest for each in found if each.largest is not None), default=None),
+        relative=max(each.relative for each in found),
+        is_noise=all(each.is_noise for each in found),
     )
 
 
-def is_noise(found: Iterable[Difference]) -> bool:
-    """Whether all that differ are floating-point numbers, in less than half of their digits."""
-    return all(place.is_noise for place in found)
-
-
 def _named(where: str, expected: str, got: str) -> Difference:
-    return Difference(f"{where}expected {expected}, got {got}", where.replace(" ", ""), expected, got)
+    return Difference(f"{where}expected {expected}, got {got}", where.replace(" ", ""))
 
 
 def _in_mappings(
@@ -256,14 +259,12 @@ def _in_elements(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], whe
     if epsilon:
         with np.errstate(all="ignore"):
             relative = float((distance[unlike] / magnitude[unlike]).max())
-    place = where.replace(" ", "") + str(index)
     is_noise = epsilon > 0 and relative <= _noise(epsilon)
-    values = str(left[first]), str(right[first])
-    return Difference(text, place, *values, count, left.size, largest, relative, is_noise)
+    return Difference(text, where.replace(" ", "") + str(index), count, largest, relative, is_noise)
 
 
 def _distances(left: Any, right: Any) -> tuple[Any, Any, float]:
-    """Return how far numbers are apart, the magnitudes of the left ones, and their epsilon; see Tolerance, Unlike."""
+    """Return how far numbers differ, the magnitudes of the left ones, and their epsilon; see Tolerance."""
     import numpy as np
 
     kind = left.dtype.kind
@@ -290,3 +291,54 @@ def _noise(epsilon: float) -> float:
 
 def _finite(number: float) -> float | None:
     return number if math.isfinite(number) else None
+
+
+def add_tolerances(document: Any, differing: Iterable[Difference]) -> None:
+    """Add tolerances of noise to the document of pipeline.toml, with a comment of what they mean.
+
+    A tolerance covers the one that stood there before too.
+
+    Parameters
+    ----------
+    document
+        The document of tomlkit.
+    differing
+        The noise of tokens; those of one token may be several.
+    """
+    with optional_import():
+        import tomlkit
+
+    for noise in differing:
+        entries = document.setdefault("tolerance", tomlkit.table(is_super_table=True))
+        known, entry = entries.get(noise.token, {}), tomlkit.table()
+        for line in _MEANING:
+            entry.add(tomlkit.comment(line.format(SAFETY)))
+        for name, bound in (("absolute", noise.largest or 0.0), ("relative", noise.relative)):
+            # One digit is enough, rounded up: people read the file, and small changes of the noise don't change it.
+            entry.add(name, max(_rounded_up(SAFETY * bound), known.get(name, 0.0)))
+        entries[noise.token] = entry
+
+
+def _rounded_up(number: float) -> float:
+    """Return a number rounded up to one digit."""
+    if number == 0.0:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(number)))
+    return float(f"{math.ceil(number / step) * step:.0e}")
+
+
+def read_tolerances(document: Mapping[str, Any]) -> dict[str, Tolerance]:
+    """Return the tolerances of pipeline.toml.
+
+    Raises
+    ------
+    KeyError, TypeError
+        An entry lacks a bound, or has one that is no number of 0 or more.
+    """
+    found = {}
+    for token, entry in document.get("tolerance", {}).items():
+        bounds = (entry["absolute"], entry["relative"])
+        if not all(type(bound) in (int, float) and 0 <= bound < math.inf for bound in bounds):
+            raise TypeError(f"the tolerance of {token!r} is {bounds!r}, not two numbers of 0 or more")
+        found[token] = Tolerance(*map(float, bounds))
+    return found

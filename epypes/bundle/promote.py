@@ -7,21 +7,21 @@ passed them all replaces an older one.
 
 from __future__ import annotations
 
-import tempfile
+import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.adapters import ANSWERS, is_usual, record_answer
+from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.clone import clone_runner
-from epypes.bundle.determinism import learn
 from epypes.bundle.expressions import write_arrays
 from epypes.bundle.graphs import parameters_of
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
-from epypes.bundle.proof import prove, swap_folders
+from epypes.bundle.proof import draft_folder, prove, swap_folders
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import (
     Settings,
@@ -31,7 +31,7 @@ from epypes.bundle.settings import (
     write_settings,
     write_stored_arrays,
 )
-from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
+from epypes.errors import EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import CompGraph, colour_order
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
@@ -128,8 +128,7 @@ def promote(
         Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
         or mappings by token.
     on_progress
-        Called with what is being done: the functions are run three times more, to learn which tokens they repeat to
-        the last bit and how far noise moves the others.
+        Called with what is being done, and with what the replays found that is worth knowing.
 
     Raises
     ------
@@ -149,9 +148,8 @@ def promote(
     try:
         _check_place(target)
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{target.name[:40]}-", dir=target.parent) as scratch:
-            draft = Path(scratch) / target.name
-            _write(draft, target, subject, outputs, samples, on_progress)
+        with draft_folder(target) as draft:
+            _write(draft, target, subject, outputs, samples)
             on_progress("replaying in a fresh process")
             for note in prove(draft, target).notes:
                 on_progress(note)
@@ -171,7 +169,7 @@ def _check_place(target: Path) -> None:
     around = next((parent for parent in target.parents if (parent / MANIFEST).is_file()), None)
     if around is not None:
         raise PromotionRefused(
-            target, [f"{target} is inside the bundle {around}, which is sealed. Name another folder."]
+            target, [f"{target} is inside the bundle {around}, whose files may not change. Name another folder."]
         )
 
 
@@ -191,7 +189,6 @@ def _write(
     subject: Subject,
     outputs: Sequence[str] | None,
     samples: Iterable[Any],
-    on_progress: Callable[[str], None],
 ) -> None:
     """Write all that can be written without running anything new; raise every reason against it at once."""
     runner, cg = subject.runner, subject.cg
@@ -211,13 +208,6 @@ def _write(
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
     runs = [*_runs(target, subject, samples)]
-    try:
-        learnt = learn(cg, runner.hyperparameters, runs, wanted, on_progress)
-    except BundleError as error:
-        raise PromotionRefused(target, [str(error)]) from error
-    if learnt.reasons:
-        raise PromotionRefused(target, learnt.reasons)
-    settings = replace(settings, tolerances=learnt.tolerances)
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
@@ -257,18 +247,20 @@ def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
 
 
 def _record(draft: Path, name: str, target: Path, subject: Subject, run: Run, settings: Settings) -> None:
-    """Record a run as a sample, and the answer of the user's own f_out if another run gives the same."""
+    """Record a run as a sample, with the answer that the user's own f_out makes of it."""
     from epypes.wire.samples import save_sample
 
+    save = partial(save_sample, draft / SAMPLES / name, rgb=settings.rgb)
     try:
         inputs, outputs = ({token: run[token] for token in side} for side in (settings.inputs, settings.outputs))
-        save_sample(draft / SAMPLES / name, inputs, outputs, rgb=settings.rgb)
+        if "f_out" in subject.ports:
+            answer = answer_of(subject.ports["f_out"], settings.name, run, settings.attributes)
+            # An answer without a codec can't be sent either.
+            with contextlib.suppress(MessageError):
+                return save(inputs, outputs if answer is None else {**outputs, ANSWER: answer})
+        save(inputs, outputs)
     except MessageError as error:
         raise PromotionRefused(target, [str(error)]) from error
-    # An answer is compared to the last bit, which noise would change.
-    if "f_out" in subject.ports and not settings.tolerances:
-        runs = run, clone_runner(subject.runner).run_on(inputs)
-        record_answer(draft / ANSWERS / name, subject.ports["f_out"], settings.name, runs, settings.attributes)
 
 
 def _replace(draft: Path, target: Path) -> None:

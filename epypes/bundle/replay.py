@@ -1,4 +1,4 @@
-"""The replay of a bundle's samples, alone in a fresh process, compared with what was recorded.
+"""The replay of a bundle's samples, compared with what was recorded; in this process, or alone in a fresh one.
 
 Run as a program (``python -s -P -m epypes.bundle.replay FOLDER REPORT``) it is that process. With ``--record`` it
 records the samples anew instead.
@@ -6,29 +6,45 @@ records the samples anew instead.
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import json
 import os
 import subprocess
 import sys
 import tempfile
+import threading
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any
+from types import CodeType, FrameType
+from typing import Any, Final, Self
 
-from epypes.bundle.adapters import ANSWERS, answer_differences, record_answer
-from epypes.bundle.compare import Difference, difference, differences
-from epypes.bundle.conditions import library_settings, without_python
-from epypes.bundle.coverage import LineCoverage
+from epypes.bundle.adapters import ANSWER, answer_of
+from epypes.bundle.compare import Difference, difference, differences, largest_of
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
-from epypes.bundle.manifest import environment
-from epypes.bundle.requirements import imported_names, requirement_lines
-from epypes.errors import BundleError, EpypesError
-from epypes.run import CompGraphRunner
+from epypes.bundle.manifest import check_manifest, environment, environment_differences, recorded_environment
+from epypes.bundle.requirements import REQUIREMENTS, fresh_environment, imported_names, pins, requirement_lines
+from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
+from epypes.graph import CompGraph
+from epypes.run import CompGraphRunner, Run
 from epypes.wire.samples import load_sample, save_sample
 from epypes.wording import counted
+
+REPLAY_TIMEOUT_S: Final = 600.0
+# Noise goes up and down: 1 in 362,880 series of as many runs goes further away each time by chance.
+_MOST_RUNS: Final = 10
+_MOST_NAMED: Final = 8
+_UNSTEADY: Final = (
+    "The values of {} differ from run to run in one process, too: random numbers without a seed, a counter, or a clock."
+)
+_UNKNOWN: Final = (
+    "Neither the bundle nor what it runs on has changed as far as is known: a function may depend on something that is "
+    "not a token, such as a file, the current folder, or what was installed beside its package."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +63,6 @@ class ReplayReport:
         The lines of requirements.txt, from what the replay imported; empty where it ran in this process.
     environment
         What the replay ran on: Python, platform, processor, OpenCV's build and threads.
-    unsteady
-        The tokens that differ from what was recorded, and from run to run as well.
     causes
         What the differences likely come from, the likeliest first.
     notes
@@ -64,7 +78,6 @@ class ReplayReport:
     differences: tuple[Difference, ...]
     requirements: tuple[str, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
-    unsteady: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     outside: tuple[str, ...] = ()
@@ -86,28 +99,131 @@ class ReplayReport:
         return {"identical": self.identical, **asdict(self)}
 
 
-REPLAY_TIMEOUT_S = 600.0
+def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
+    """Replay a bundle's samples in this process.
+
+    Parameters
+    ----------
+    bundle
+        The bundle.
+    twice
+        Whether every sample is replayed a second time, in the opposite order: what a function remembers from call to
+        call is something else then. That time it is also checked that no function changes an object in its input.
+    """
+    pipeline_of(bundle, None, None)  # what serves it can be made
+    seen: dict[Path, list[dict[str, Difference | None]]] = {path: [] for path in bundle.samples}
+    for path in bundle.samples:
+        seen[path].append(_compared(bundle, path))
+    for path in reversed(bundle.samples) if twice else ():
+        seen[path].append(_compared(bundle, path, check_mutation=True))
+    found: list[Difference] = []
+    for path, passes in seen.items():
+        differing = {
+            token: [each[token] for each in passes] for token in passes[0] if any(each[token] for each in passes)
+        }
+        found += _explained(bundle, path, differing) if differing else ()
+    tokens = sum(len(passes[0]) for passes in seen.values())
+    return ReplayReport(len(bundle.samples), tokens, tuple(found), environment=environment())
+
+
+def _compared(bundle: Bundle, path: Path, *, check_mutation: bool = False) -> dict[str, Difference | None]:
+    """Run a sample, and return by token what is not as it was recorded."""
+    inputs, outputs = load_sample(path)
+    settings = bundle.settings
+    if (set(inputs), outputs.keys() - {ANSWER}) != (set(settings.inputs), set(settings.outputs)):
+        tokens = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
+        text = f"Sample {path.stem} has the tokens {tokens}, which are not those of pipeline.toml. Promote again."
+        raise BundleError(path, text)
+    got = _values(bundle, _run(bundle, inputs, check_mutation=check_mutation), outputs)
+    return {
+        token: difference(path.stem, token, differences(expected, got[token], settings.tolerances.get(token)))
+        for token, expected in outputs.items()
+    }
+
+
+def record_again(bundle: Bundle) -> ReplayReport:
+    """Run a bundle's samples in this process, and record their outputs."""
+    for path in bundle.samples:
+        inputs, outputs = load_sample(path)
+        save_sample(path, inputs, _values(bundle, _run(bundle, inputs), outputs), rgb=bundle.settings.rgb)
+    return ReplayReport(len(bundle.samples), 0, ())
+
+
+def _run(bundle: Bundle, inputs: Mapping[str, Any], *, check_mutation: bool = False) -> Run:
+    runner = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters, check_mutation=check_mutation)
+    return runner.run(**inputs)
+
+
+def _values(bundle: Bundle, run: Run, names: Collection[str]) -> dict[str, Any]:
+    """Return values of a run by token, and the answer that is made of it where that is among the names."""
+    values = {name: run[name] for name in names if name != ANSWER}
+    if ANSWER in names:
+        settings = bundle.settings
+        values[ANSWER] = answer_of(bundle.own["f_out"], settings.name, run, settings.attributes)
+    return values
+
+
+def _explained(
+    bundle: Bundle, path: Path, differing: Mapping[str, Sequence[Difference | None]]
+) -> Iterator[Difference]:
+    """Give the difference of each token of a sample, with the first function that computes something else each time.
+
+    The sample is run some times more. What goes further away each time is a clock or a counter, and no noise.
+    """
+    inputs, _ = load_sample(path)
+    noise = {token for token, entries in differing.items() if all(entry.is_noise for entry in entries if entry)}
+    distances: dict[str, list[float]] = {token: [0.0] for token in noise}
+    unsteady = {token for token, entries in differing.items() if len({entry and entry.text for entry in entries}) > 1}
+    first: dict[str, Any] = {}
+    for number in range(_MOST_RUNS):
+        run = _run(bundle, inputs)
+        values = _values(bundle, run, {*run, *differing})
+        first = first or values
+        for token, value in values.items():
+            found = difference("", token, differences(first[token], value))
+            unsteady |= {token} if found else set()
+            if number and token in distances:
+                distances[token].append(found.largest or 0.0 if found else 0.0)
+        growing = {token for token, found in distances.items() if all(left < right for left, right in pairwise(found))}
+        if number > 1 and not growing:
+            break
+    for token, entries in differing.items():
+        entry = largest_of([entry for entry in entries if entry])
+        function = _origin(bundle.cg, token, unsteady) if token in unsteady else ""
+        yield replace(entry, is_noise=entry.is_noise and token not in growing, function=function)
+
+
+def _origin(cg: CompGraph, token: str, unsteady: Collection[str]) -> str:
+    """Return the first function on the way to a token that computes something else each time."""
+    if token == ANSWER:
+        return "f_out"
+    name = cg.digraph.producer[token]
+    before = next((given for given in cg.func_inputs(name) if given in unsteady), None)
+    return name if before is None else _origin(cg, before, unsteady)
+
+
+# -- in a process of its own -----------------------------------------------------------------------------------------
 
 
 def replay_isolated(
     folder: Path,
-    options: Sequence[str] = (),
     *,
+    record: bool = False,
     timeout_s: float = REPLAY_TIMEOUT_S,
     python: str = sys.executable,
     environment: Mapping[str, str] | None = None,
     cwd: Path | None = None,
 ) -> ReplayReport:
-    """Replay in a new interpreter that sees neither the current folder nor the variables that Python reads.
+    """Replay every sample twice in a new interpreter that has neither the current folder nor Python's variables.
+
+    The manifest is not compared: that is the caller's part.
 
     Parameters
     ----------
     folder
         The bundle.
-    options
-        ``"--unsealed"``: it need not be what was promoted. ``"--twice"``: every sample is replayed a second time, in
-        the opposite order. ``"--unwatched"``: without the requirements, and the files outside of the bundle.
-        ``"--record"``: the samples are recorded anew, and nothing is compared.
+    record
+        Whether the samples are recorded anew, and nothing is compared.
     timeout_s
         When the process is ended.
     python
@@ -120,6 +236,7 @@ def replay_isolated(
     BundleError
         The process failed, took longer than ``timeout_s``, or has written an error.
     """
+    options = ["--record"] if record else []
     with tempfile.TemporaryDirectory(prefix="epypes-replay-") as scratch:
         out = Path(scratch) / "report.json"
         try:
@@ -149,77 +266,19 @@ def replay_isolated(
     return ReplayReport(differences=found, **values)
 
 
-def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
-    """Replay a bundle's samples in this process.
-
-    Parameters
-    ----------
-    bundle
-        The bundle.
-    twice
-        Whether every sample is replayed a second time, in the opposite order: a function that keeps something from
-        call to call computes something else then.
-    """
-    found: list[Difference] = []
-    unsteady: dict[str, None] = {}
-    tokens = 0
-    pipeline_of(bundle, None, None)  # what serves it can be made
-    for path in bundle.samples:
-        inputs, outputs = load_sample(path)
-        if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
-            ports = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
-            why = f"its ports are {ports}, those of pipeline.toml are not"
-            found.append(Difference(why, sample=path.stem, token=", ".join(bundle.settings.outputs)))
-        run = _run(bundle, inputs)
-        differing = [*_differing(bundle, path.stem, outputs, run)]
-        if differing:
-            again = _run(bundle, inputs)
-            differs = (entry.token for entry in differing)
-            unsteady |= {token: None for token in differs if next(differences(run[token], again[token]), None)}
-        found += [*differing, *answer_differences(bundle, path.stem, run)]
-        tokens += len(outputs)
-    known = {(entry.sample, entry.token) for entry in found}
-    for path in reversed(bundle.samples) if twice else ():
-        inputs, outputs = load_sample(path)
-        again = _differing(bundle, path.stem, outputs, _run(bundle, inputs))
-        new = [entry for entry in again if (entry.sample, entry.token) not in known]
-        found += new
-        unsteady |= {entry.token: None for entry in new}
-    return ReplayReport(len(bundle.samples), tokens, tuple(found), environment=environment(), unsteady=tuple(unsteady))
+def without_python() -> dict[str, str]:
+    """Return the environment without the variables that Python reads."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
 
-def record_again(bundle: Bundle) -> ReplayReport:
-    """Run a bundle's samples in this process, and record their outputs and answers."""
-    settings = bundle.settings
-    for path in bundle.samples:
-        inputs, outputs = load_sample(path)
-        run = _run(bundle, inputs)
-        save_sample(path, inputs, {token: run[token] for token in outputs}, rgb=settings.rgb)
-        answer = bundle.path / ANSWERS / path.name
-        if answer.is_file():
-            answer.unlink()
-            record_answer(answer, bundle.own["f_out"], settings.name, (run, _run(bundle, inputs)), settings.attributes)
-    return ReplayReport(len(bundle.samples), 0, ())
-
-
-def _run(bundle: Bundle, inputs: dict[str, Any]) -> Any:
-    return CompGraphRunner(bundle.cg, bundle.settings.hyperparameters).run(**inputs)
-
-
-def _differing(bundle: Bundle, sample: str, outputs: dict[str, Any], run: Any) -> list[Difference]:
-    tolerances = bundle.settings.tolerances
-    found = (
-        difference(sample, token, differences(expected, run[token], tolerances.get(token)))
-        for token, expected in outputs.items()
-    )
-    return [entry for entry in found if entry is not None]
-
-
-def main(arguments: list[str]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
     try:
-        outcome = asdict(_replayed(folder, arguments[2:]))
+        if "--record" in arguments:
+            outcome = asdict(record_again(read_bundle(folder, compare=False)))
+        else:
+            outcome = asdict(_watched(folder))
     except EpypesError as error:
         outcome = {"error": str(error)}
     except BaseException as error:
@@ -228,13 +287,8 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
-    """Replay, or record anew, as the options say; a report has what was imported and opened unless ``--unwatched``."""
-    is_sealed, twice = not {"--unsealed", "--record"} & {*options}, "--twice" in options
-    if "--record" in options:
-        return record_again(read_bundle(folder, compare=is_sealed))
-    if "--unwatched" in options:
-        return replay(read_bundle(folder, compare=is_sealed), twice=twice)
+def _watched(folder: Path) -> ReplayReport:
+    """Replay, and report what was imported, which files were opened, and which lines did not run."""
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
         try:
@@ -244,14 +298,16 @@ def _replayed(folder: Path, options: Sequence[str]) -> ReplayReport:
             break
     before = frozenset(sys.modules)
     with FileAccess(folder) as access, LineCoverage(folder / MODULE) as coverage:
-        bundle = read_bundle(folder, compare=is_sealed)
+        bundle = read_bundle(folder, compare=False)
         access.also_in(bundle.settings.hyperparameters)
-        report = replay(bundle, twice=twice)
+        report = replay(bundle, twice=True)
     named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
-    requirements = requirement_lines(named | (sys.modules.keys() - before))
-    notes = (coverage.note,) if coverage.note else ()
     return replace(
-        report, outside=access.files, requirements=requirements, notes=notes, library_settings=library_settings()
+        report,
+        outside=access.files,
+        requirements=requirement_lines(named | (sys.modules.keys() - before)),
+        notes=(coverage.note,) if coverage.note else (),
+        library_settings=library_settings(),
     )
 
 
@@ -269,8 +325,167 @@ def _describe(error: BaseException, folder: Path) -> str:
     elif (
         isinstance(error, FileNotFoundError) and error.filename and not Path(os.fsdecode(error.filename)).is_absolute()
     ):
-        text += ". The current folder is another one there"
+        text += ". A replay runs in another working folder than the notebook"
     return f"{text} ({notes})" if notes else text
+
+
+def library_settings() -> dict[str, str]:
+    """Return how libraries are set in this process, where that changes what functions compute."""
+    found: dict[str, str] = {}
+    numpy, cv2, decimal = (sys.modules.get(name) for name in ("numpy", "cv2", "decimal"))
+    if numpy is not None:
+        raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
+        found["numpy.seterr"] = f"{raising or 'no errors are raised'}"
+    if cv2 is not None:
+        found["cv2.setUseOptimized"] = f"{cv2.useOptimized()}"
+    if decimal is not None:
+        context = decimal.getcontext()
+        found["decimal.getcontext"] = f"prec={context.prec}, rounding={context.rounding}"
+    return found
+
+
+_Trace = Callable[[FrameType, str, Any], Any]
+
+
+class LineCoverage:
+    """Records, while its block runs, which lines of a module's functions run, in every thread that begins meanwhile.
+
+    Parameters
+    ----------
+    path
+        The file of the module, as its code names it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = str(path)
+        self._run: dict[CodeType, set[int]] = {}
+
+    def __enter__(self) -> Self:
+        self._before: tuple[Any, Any] = sys.gettrace(), threading.gettrace()
+        sys.settrace(self._called)
+        threading.settrace(self._called)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        sys.settrace(self._before[0])
+        threading.settrace(self._before[1])
+
+    def _called(self, frame: FrameType, event: str, argument: Any) -> _Trace | None:
+        code = frame.f_code
+        if code.co_filename != self._file or not code.co_flags & inspect.CO_OPTIMIZED:
+            return None  # another file, or the body of a module or class
+        lines = self._run.setdefault(code, {code.co_firstlineno})
+
+        def at_line(frame: FrameType, event: str, argument: Any) -> _Trace:
+            lines.add(frame.f_lineno)
+            return at_line
+
+        return at_line
+
+    @property
+    def note(self) -> str:
+        """The lines that were left out of functions that ran, as a sentence; "" if there are none."""
+        spans = [span for code in self._run for span in _spans(code, self._run[code])]
+        if not spans:
+            return ""
+        named = ", ".join(spans[:_MOST_NAMED]) + (" and others" if len(spans) > _MOST_NAMED else "")
+        return (
+            f"No sample runs these lines of {Path(self._file).name}, so no replay proves them: {named}. "
+            "Give payloads that do: samples=[...]."
+        )
+
+
+def _spans(code: CodeType, run: set[int]) -> list[str]:
+    """Return the lines of one function that did not run, adjacent ones as one span."""
+    every = {line for _, _, line in code.co_lines() if line}
+    missed = sorted(every - run)
+    grouped = groupby(enumerate(missed), key=lambda numbered: numbered[1] - numbered[0])
+    spans = [[line for _, line in group] for _, group in grouped]
+    return [f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans]
+
+
+# -- verification --------------------------------------------------------------------------------------------------
+
+
+def verify(
+    path: str | Path, *, fresh_env: bool = False, timeout_s: float = REPLAY_TIMEOUT_S, run_anyway: bool = False
+) -> ReplayReport:
+    """Replay a bundle's samples in a fresh isolated process.
+
+    A bundle is code, and is to be trusted like code: a replay runs it with the rights of the caller. The manifest is no
+    signature.
+
+    Parameters
+    ----------
+    path
+        The bundle.
+    fresh_env
+        Whether to do so in a new environment, with what requirements.txt names and nothing else.
+    timeout_s
+        When the replay is ended.
+    run_anyway
+        Whether to replay a bundle whose files are not those of its manifest, to learn which token the change affects.
+        That runs the changed code. The bundle is refused all the same.
+
+    Returns
+    -------
+    ReplayReport
+        Its notes name what is not as it was when the samples were recorded, though it computes the same.
+
+    Raises
+    ------
+    BundleChanged
+        A file was changed, is missing or was added. Nothing of the bundle was run, unless ``run_anyway``.
+    ReplayDiffers
+        A token is not what was recorded; token, first differing index, both values and the likely cause are named.
+    BundleError
+        The folder is no bundle, its code fails, or no environment can be made.
+    """
+    folder = Path(path)
+    change: BundleChanged | None = None
+    try:
+        check_manifest(folder)
+    except BundleChanged as error:
+        if not run_anyway:
+            text = f"{error} Nothing of it was run; to run the changed code: epypes verify --run-anyway."
+            raise BundleChanged(folder, text) from None
+        change = error
+    try:
+        with fresh_environment(folder) if fresh_env else contextlib.nullcontext(sys.executable) as python:
+            report = replay_isolated(folder, timeout_s=timeout_s, python=python)
+    except BundleError as error:
+        if change is None:
+            raise
+        raise BundleChanged(folder, f"{change} It can't be replayed: {error}") from error
+    if change is not None:
+        if report.identical:
+            raise BundleChanged(folder, f"{change} It still computes what was recorded.")
+        raise ReplayDiffers(folder, replace(report, causes=(str(change),)))
+    notes = (
+        *_pinned_otherwise(folder, report),
+        *environment_differences(recorded_environment(folder), report.environment),
+    )
+    if report.identical:
+        return replace(report, notes=(*report.notes, *report.outside, *notes))
+    tokens = ", ".join(dict.fromkeys(repr(entry.token) for entry in report.differences if entry.function))
+    causes = (*([_UNSTEADY.format(tokens)] if tokens else []), *notes)
+    raise ReplayDiffers(folder, replace(report, causes=causes or (_UNKNOWN,)))
+
+
+def _pinned_otherwise(folder: Path, report: ReplayReport) -> list[str]:
+    """Return as sentences which packages are not as pinned."""
+    try:
+        lines = (folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    pinned, imported = pins(lines), pins(report.requirements)
+    found = [
+        f"{REQUIREMENTS} pins {name} {version}, and {imported[name]} is imported here."
+        for name, version in pinned.items()
+        if name in imported and imported[name] != version
+    ]
+    missing = sorted(imported.keys() - pinned.keys())
+    return found + ([f"{REQUIREMENTS} does not name what is imported: {', '.join(missing)}."] if missing else [])
 
 
 if __name__ == "__main__":

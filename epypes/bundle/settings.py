@@ -18,8 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from epypes.bundle.compare import Tolerance
-from epypes.bundle.determinism import add_tolerances, read_tolerances
+from epypes.bundle.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
 from epypes.graph import CompGraph
@@ -154,7 +153,6 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
             for name, value in values.items():
                 table.add(name, _table(written(value)))
             document.add(section, table)
-    add_tolerances(document, settings.tolerances)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest, digest
-from epypes.bundle.proof import prove, swap_folders
+from epypes.bundle.proof import draft_folder, prove, swap_folders
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.bundle.settings import alike, fits, read, written
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
@@ -71,8 +70,7 @@ def write_back(
     if changed == text:
         return WriteBack("", before)
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}-", dir=folder.parent) as scratch:
-            draft = Path(scratch) / folder.name
+        with draft_folder(folder) as draft:
             shutil.copytree(folder, draft, ignore=shutil.ignore_patterns("__pycache__"))
             (draft / SETTINGS).write_text(changed, encoding="utf-8")
             _record(draft, folder, timeout_s)
@@ -131,7 +129,7 @@ def _diff(before: str, after: str) -> str:
 def _record(draft: Path, target: Path, timeout_s: float) -> None:
     """Record the outputs of a draft's samples again, and prove it."""
     try:
-        replay_isolated(draft, ["--record"], timeout_s=timeout_s)
+        replay_isolated(draft, record=True, timeout_s=timeout_s)
         prove(draft, target, timeout_s)
     except BundleError as error:
         reasons = error.reasons if isinstance(error, PromotionRefused) else (str(error),)
