@@ -83,7 +83,7 @@ class Difference:
     function: str = ""
 
     def __str__(self) -> str:
-        return f"sample {self.sample}, token {self.token!r}: {self.text}" if self.token else self.text
+        return f"sample {self.sample}, token {self.token!r}: {self.text}" if self.sample else self.text
 
 
 def first_difference(expected: Any, got: Any, tolerance: Tolerance | None = None) -> str | None:

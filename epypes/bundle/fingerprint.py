@@ -61,6 +61,7 @@ _READERS: Final = frozenset(
     }
 )
 _LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
+_WATCHED: Final = "__epypes_"
 _LEAVES: Final = (type(None), bool, float, complex, type(...), type(NotImplemented))
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset({"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "uuid"})
@@ -277,7 +278,7 @@ class Digester:
             # Beside its registry it has a cache, which each call may fill.
             self._add_named({"registry": cells.get("registry", vars(function).get("registry"))})
         else:
-            self._add_named(vars(function))
+            self._add_attributes(function)
             self._add_named(cells)
         if not _is_installed(str(function.__globals__.get("__name__", ""))):
             self._add_named(self._globals(function))
@@ -311,6 +312,10 @@ class Digester:
         own_functions = {name.rpartition(".")[2] for name, one in read.items() if isinstance(one, types.FunctionType)}
         self.reader = self.reader or min(_READERS & (names | attributes) - own_functions, default="")
         return read
+
+    def _add_attributes(self, function: Any) -> None:
+        """Add the attributes of a function but for those by which EPypes watches it."""
+        self._add_named({name: value for name, value in vars(function).items() if not name.startswith(_WATCHED)})
 
     def _add_code(self, code: types.CodeType) -> None:
         counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
@@ -435,7 +440,7 @@ _WAYS: Final[tuple[tuple[Any, Callable[[Digester, Any], None]], ...]] = (
     (types.MethodType, lambda into, found: into._add_all("method", (found.__self__, found.__func__))),
     ((staticmethod, classmethod), lambda into, found: into._add_all(type(found).__name__, (found.__func__,))),
     (property, lambda into, found: into._add_all("property", (found.fget, found.fset, found.fdel))),
-    (functools._lru_cache_wrapper, lambda into, found: into._add_named(vars(found))),
+    (functools._lru_cache_wrapper, Digester._add_attributes),
     # The class that has them is met before them.
     ((types.MemberDescriptorType, types.GetSetDescriptorType), lambda into, found: into._put("slot", found.__name__)),
     # They have no state but that of this moment.

@@ -73,7 +73,7 @@ _UNLOCKS: Final = frozenset(
 _OF_PYTHON: Final = frozenset(
     {"__builtins__", "__warningregistry__", "__dict__", "__weakref__", "__doc__", "__abstractmethods__", "_abc_impl"}
     | {"__annotations__", "__annotations_cache__", "__annotate__", "__annotate_func__", "__static_attributes__"}
-    | {"_value2member_map_"}
+    | {"_value2member_map_", "__slotnames__"}
 )
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
@@ -382,7 +382,7 @@ class _CacheCheck:
 
 
 def check_caches(names: dict[str, Any]) -> None:
-    """Have each lru_cache among the names of a module, in its dicts and classes note what its function returns."""
+    """Have each lru_cache among the names of a module, in its dicts, classes and closures note what is computed."""
     made: dict[int, Any] = {}
 
     def checked(name: str, value: Any) -> Any:
@@ -399,6 +399,11 @@ def check_caches(names: dict[str, Any]) -> None:
             for name, part in [*vars(value).items()]:
                 if type(part) is _CACHED:
                     type.__setattr__(value, name, checked(f"{value.__name__}.{name}", part))
+        elif isinstance(value, types.FunctionType) and is_own(str(value.__module__)):
+            for name, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
+                for part in _read_cell(cell):
+                    if type(part) is _CACHED:
+                        cell.cell_contents = checked(name, part)
 
 
 def _checked(name: str, cached: Any) -> Any:

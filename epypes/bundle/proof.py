@@ -8,16 +8,18 @@ tolerance.
 
 from __future__ import annotations
 
+import ast
 import ctypes
 import fcntl
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Final
@@ -25,7 +27,7 @@ from typing import Final
 from epypes.bundle.adapters import ANSWER
 from epypes.bundle.compare import Difference, add_tolerances
 from epypes.bundle.file_access import named_here
-from epypes.bundle.load import SAMPLES, SETTINGS
+from epypes.bundle.load import MODULE, SAMPLES, SETTINGS
 from epypes.bundle.manifest import write_manifest
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, ReplayReport, library_settings, replay_isolated, without_python
 from epypes.bundle.requirements import REQUIREMENTS
@@ -41,6 +43,7 @@ _RENAME_EXCHANGE: Final = 2
 _PROCESSES: Final = 2
 # What the names of folders end with in which drafts are.
 _DRAFTS: Final = ".epypes-draft"
+_VARIABLE: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _THREAD_VARIABLES: Final = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -60,14 +63,14 @@ class Condition:
     way_out
         What to change in the function, as a sentence.
     environment
-        The variables of the environment under the other condition; "" for none.
+        The variables of the environment under the other condition; None for one that is not there.
     is_folder
         Whether it is the working folder.
     """
 
     name: str
     way_out: str
-    environment: Mapping[str, str]
+    environment: Mapping[str, str | None]
     is_folder: bool = False
 
 
@@ -91,10 +94,21 @@ UNKNOWN: Final = Condition(
 )
 
 
-def other_conditions() -> tuple[Condition, ...]:
-    """Return the conditions that a second process has otherwise than this one and its children."""
+def other_conditions(module: Path) -> tuple[Condition, ...]:
+    """Return the conditions that a second process has otherwise than this one and its children.
+
+    Variables of the environment that a module names as texts are not there, or "1" if they are not here. The others
+    are as they are here: libraries need them.
+    """
     count = "1" if _threads() != 1 else "3"
+    texts = (node.value for node in ast.walk(ast.parse(module.read_bytes())) if isinstance(node, ast.Constant))
+    named = {text for text in texts if isinstance(text, str) and _VARIABLE.fullmatch(text)}
     return (
+        Condition(
+            "the variables of the environment",
+            "Read them in the notebook, and make what is read a token.",
+            {"EPYPES_PROOF": "1", **{name: None if name in os.environ else "1" for name in sorted(named)}},
+        ),
         Condition(
             "the hash seed (PYTHONHASHSEED)",
             "The order of a set of strings is another one in each process: sort it, as in sorted(names).",
@@ -167,10 +181,11 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
     PromotionRefused
         The draft fails, or computes something else. The token and what changes it are named.
     """
-    conditions = other_conditions()
+    conditions = other_conditions(draft / MODULE)
     with tempfile.TemporaryDirectory(prefix="epypes-proof-") as scratch, ThreadPoolExecutor(_PROCESSES) as pool:
         replayed = partial(_replayed, draft, target, Path(scratch), timeout_s)
         usual, other = pool.map(replayed, [(), conditions])
+        other = _compared(other, usual)
         found = [*usual.differences, *other.differences]
         # What is the same in each run of a process, and not what the notebook computed, is not what threads make.
         refused = {entry.token for entry in usual.differences if not entry.function}
@@ -186,6 +201,16 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
     write_manifest(draft, usual.environment)
     return usual
+
+
+def _compared(report: ReplayReport, usual: ReplayReport) -> ReplayReport:
+    """Return a report with the functions that are another one than in the usual replay, as differences."""
+    found = [
+        Difference(f"What function {name!r} refers to is another one in another process.", token=f"function {name}")
+        for name, fingerprint in report.fingerprints.items()
+        if usual.fingerprints.get(name, fingerprint) != fingerprint
+    ]
+    return replace(report, differences=(*report.differences, *found))
 
 
 def _changed_settings(usual: ReplayReport) -> list[str]:
@@ -217,9 +242,10 @@ def _tolerate(draft: Path, noise: Sequence[Difference]) -> None:
 
 def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, changed: Sequence[Condition]) -> ReplayReport:
     """Replay under usual conditions but for those that are changed; a failure is a difference of no token."""
-    environment = usual_environment()
+    variables: dict[str, str | None] = {**usual_environment()}
     for condition in changed:
-        environment |= condition.environment
+        variables |= condition.environment
+    environment = {name: value for name, value in variables.items() if value is not None}
     cwd = scratch / ("there" if any(condition.is_folder for condition in changed) else "here")
     cwd.mkdir(exist_ok=True)
     try:
@@ -244,10 +270,10 @@ def _reasons(
     causes = {entry.token: [CALL] for entry in found.values() if entry.function}
     unexplained = refused - causes.keys()
     if unexplained:
-        conditions = other_conditions()
+        conditions = other_conditions(draft / MODULE)
         reports = replays([(), *((condition,) for condition in conditions)])
         for condition, report in zip((PROCESS, *conditions), reports, strict=True):
-            texts = _texts(report)
+            texts = _texts(_compared(report, usual))
             for token in unexplained & ({""} if "" in texts else unexplained):
                 # What another process alone changes differs under each condition too.
                 if texts.get(token) != known.get(token) and PROCESS not in causes.setdefault(token, []):

@@ -25,12 +25,14 @@ from typing import Any, Final, Self
 from epypes.bundle.adapters import ANSWER, answer_of
 from epypes.bundle.compare import Difference, difference, differences, largest_of
 from epypes.bundle.file_access import FileAccess
+from epypes.bundle.fingerprint import Digester
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.manifest import check_manifest, environment, environment_differences, recorded_environment
 from epypes.bundle.requirements import REQUIREMENTS, fresh_environment, imported_names, pins, requirement_lines
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Run
+from epypes.run.guard import as_written
 from epypes.wire.samples import load_sample, save_sample
 from epypes.wording import counted
 
@@ -71,6 +73,8 @@ class ReplayReport:
         The files outside of the bundle that its functions open or name, as sentences.
     library_settings
         How libraries were set that the replay imported.
+    fingerprints
+        Digests of the functions and of what they refer to, as the import of the module made them.
     """
 
     samples: int
@@ -82,6 +86,7 @@ class ReplayReport:
     notes: tuple[str, ...] = ()
     outside: tuple[str, ...] = ()
     library_settings: Mapping[str, str] = field(default_factory=dict)
+    fingerprints: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:
@@ -300,6 +305,7 @@ def _watched(folder: Path) -> ReplayReport:
     with FileAccess(folder) as access, LineCoverage(folder / MODULE) as coverage:
         bundle = read_bundle(folder, compare=False)
         access.also_in(bundle.settings.hyperparameters)
+        fingerprints = _fingerprints(bundle)
         report = replay(bundle, twice=True)
     named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
     return replace(
@@ -308,7 +314,17 @@ def _watched(folder: Path) -> ReplayReport:
         requirements=requirement_lines(named | (sys.modules.keys() - before)),
         notes=(coverage.note,) if coverage.note else (),
         library_settings=library_settings(),
+        fingerprints=fingerprints,
     )
+
+
+def _fingerprints(bundle: Bundle) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, function in {**bundle.cg.functions, **bundle.own}.items():
+        digester = Digester()
+        digester.add(as_written(function))
+        found[name] = digester.digest().hex()
+    return found
 
 
 def _describe(error: BaseException, folder: Path) -> str:

@@ -19,7 +19,7 @@ def slice_graph(functions):
     gathered, written = gather(lambda needed: Graphs(needed).write(cg).references)
     if not gathered.refusals:
         text = emit_module(Settings("case", ("x",), ("y",), {}), cg, gathered, written)
-        why, _ = refusal(text, {}, lambda made: _pairs(functions, made))
+        why = refusal(text, {}, lambda made: _pairs(functions, made))
         gathered.refusals += [why] if why else []
     return gathered, written
 

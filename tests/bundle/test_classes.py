@@ -140,11 +140,6 @@ REFUSED = {
     "a value of a class above": ("G = 2\nclass Above:\n    K = G + 1\nclass A(Above):\n    def g(self): return self.K\nG = 5\n" + USED, r"Class 'Above' .* its 'K' is 3 in the notebook and 6"),
     "a private value more": (f"class A:\n    def g(self): return getattr(self, '_k', 1)\nA._k = 5\n{USED}", r"its '_k' is defined only in the notebook"),
     "a number of NumPy's more": (f"import numpy as np\nclass A:\n    def g(self): return self.q\nA.q = np.float64(3)\n{USED}", r"its 'q' is defined only in the notebook"),
-    "a value that was read": (
-        f"class A:\n    K = id(1)\n    def g(self): return self.K\n{USED}",
-        "What function 'f' refers to is another one .* It depends on the process that computes it",
-    ),
-    "a default that was read": (f"class A:\n    def g(self, k=id(1)): return k\n{USED}", "What function 'f' refers to is another one .* It depends on the process that computes it"),
     "a record that changes what it is given": (
         "import dataclasses\n@dataclasses.dataclass\nclass Twice:\n    k: float\n    def __post_init__(self):\n        self.k *= 2\n"
         "ONE = Twice(30)\ndef f(x):\n    return ONE.k + x\n", r"its 'ONE' attribute 'k' is 60 in the notebook and 120 in the module",

@@ -40,8 +40,41 @@ DEPENDS = {
         "import os, time\ndef use(x):\n    return os.getcwd() + time.strftime('%H:%M', time.localtime(0))",
         "the working folder and the time zone (TZ)",
     ),
+    "a variable of the environment": (
+        "import os\ndef use(x):\n    return int(os.environ.get('GAIN', '2'))",
+        "the variables of the environment",
+    ),
     "the process": ("import os\ndef use(x):\n    return os.getpid()", "the process that computes it"),
 }
+# By what an import makes: a cell that defines `use`, and what the reason names.
+IMPORTED = {
+    "a class with the order of a set": (
+        "class C:\n    K = [*map(len, {'red', 'green', 'blue'})]\ndef use(x):\n    return C.K[0] * 0",
+        "the hash seed (PYTHONHASHSEED)",
+    ),
+    "a class with an address": (
+        "class C:\n    K = id(1)\ndef use(x):\n    return C.K * 0",
+        "the process that computes it",
+    ),
+    "a default of a method that was read": (
+        "import os\nclass C:\n    def g(self, k=os.getpid()): return k\ndef use(x):\n    return C().g() * 0",
+        "the process that computes it",
+    ),
+    "an argument of a decorator that was read": (
+        "import functools, os\ndef d(k):\n    def deco(g):\n        @functools.wraps(g)\n        def w(x):\n            return g(x) * k * 0\n"
+        "        return w\n    return deco\n@d(os.getpid())\ndef use(x):\n    return x.sum()",
+        "the process that computes it",
+    ),
+    "a decorator that reads the environment": (
+        "import functools, os\ndef d(g):\n    k = int(os.environ.get('GAIN', '2'))\n    @functools.wraps(g)\n    def w(x):\n        return g(x) * k * 0\n"
+        "    return w\n@d\ndef use(x):\n    return x.sum()",
+        "the variables of the environment",
+    ),
+    "a class that reads the environment": (
+        "class C:\n    from os import environ as env\n    K = len(env.get('HOME', ''))\ndef use(x):\n    return C.K * 0",
+        "the variables of the environment",
+    ),
+}  # fmt: skip
 
 
 def refusal(source, to):
@@ -66,6 +99,13 @@ def test_what_depends_on_a_condition_is_refused_with_token_and_condition(what, t
     assert "'size'" not in text
 
 
+@pytest.mark.parametrize("what", IMPORTED)
+def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_shows_it(what, tmp_path):
+    source, condition = IMPORTED[what]
+    text = refusal(source, tmp_path / "bundle")
+    assert f"What function 'use' refers to is another one in another process. It depends on {condition}" in text
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -77,7 +117,7 @@ def test_what_depends_on_a_condition_is_refused_with_token_and_condition(what, t
 def test_a_function_that_keeps_something_from_call_to_call_is_refused(source, tmp_path):
     text = refusal(source, tmp_path / "bundle")
     assert "token 'used': " in text
-    assert "It depends on how often and in which order it is called" in text
+    assert "It depends on when, how often and in which order function 'use' is called" in text
 
 
 def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):
@@ -143,5 +183,5 @@ def test_noise_that_the_number_of_threads_makes_is_tolerated_as_such(tmp_path):
     bundle = ep.promote(runner, tmp_path / "bundle")
     assert 0 < bundle.settings.tolerances["used"].relative < 1e-4
     text = (bundle.path / "pipeline.toml").read_text()
-    assert "[tolerance.used]\n# Another number of threads, or the like, gave other last digits: a replay may" in text
+    assert "[tolerance.used]\n# Replays of the samples gave other last digits: a replay may" in text
     assert verify(bundle.path).identical

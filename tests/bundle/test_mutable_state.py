@@ -202,8 +202,6 @@ CONSTANT = {
     "many = np.vectorize(lambda n: n + 1)\ndef f(x):\n    L.debug('%s', x)\n    return str(P), hash(P) and 1, R.findall('aa'), int(many(x))",
     "cached property": "class C:\n    @functools.cached_property\n    def items(self): return []\nc = C()\n"
     "def f(x):\n    c.items.append(x)\n    return len(c.items)",
-    "list of a cache that no name of the module has": "def make():\n    @functools.cache\n    def items(n): return [n]\n    def f(x):\n        found = items(3)\n"
-    "        found.append(x)\n        return len(found)\n    return f\nf = make()",
     "cache of a partial": "g = functools.cache(functools.partial(max, 3))\ndef f(x):\n    return g(x)",
     "more mutable values than a cache may have": "@functools.cache\ndef items(n): return [n]\ndef f(x):\n    return sum(len(items(n)) for n in range(1500))",
     "objects of the call": "class C:\n    def __init__(self): self.n = 0\n    def add(self, x): self.n += x\ndef f(x):\n    c = C()\n    c.add(x)\n    return c.n",

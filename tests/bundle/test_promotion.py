@@ -532,7 +532,7 @@ def test_ports_that_are_not_those_of_the_sample_are_found(bundle, port, value):
     settings = bundle.path / "pipeline.toml"
     settings.write_text(re.sub(rf"{port} = .*", f"{port} = {value}", settings.read_text()))
     write_manifest(bundle.path)
-    with pytest.raises(BundleError, match="its ports are image -> edges"):
+    with pytest.raises(BundleError, match="has the tokens image -> edges, which are not those of pipeline.toml"):
         verify(bundle.path)
 
 
