@@ -382,28 +382,35 @@ class _CacheCheck:
 
 
 def check_caches(names: dict[str, Any]) -> None:
-    """Have each lru_cache among the names of a module, in its dicts, classes and closures note what is computed."""
-    made: dict[int, Any] = {}
+    """Have each lru_cache of a module note what its function returns."""
+    made: dict[int, tuple[Any, Any]] = {}
+    for name, cached, put in _caches_of(names):
+        if id(cached) not in made:
+            made[id(cached)] = cached, _checked(name, cached)
+        put(made[id(cached)][1])
 
-    def checked(name: str, value: Any) -> Any:
-        if not is_own(str(value.__module__)):
-            return value
-        if id(value) not in made:
-            made[id(value)] = _checked(name, value)
-        return made[id(value)]
 
+def _caches_of(names: dict[str, Any]) -> Iterator[tuple[str, Any, Callable[[Any], object]]]:
+    """Give the caches among the names of a module, in its dicts, classes and closures, and what replaces each."""
     for value in [names, *names.values()]:
+        found: list[tuple[str, Any, Callable[[Any], object]]] = []
         if type(value) is dict:
-            value.update({key: checked(str(key), part) for key, part in value.items() if type(part) is _CACHED})
-        elif isinstance(value, type) and is_own(str(value.__module__)):
-            for name, part in [*vars(value).items()]:
-                if type(part) is _CACHED:
-                    type.__setattr__(value, name, checked(f"{value.__name__}.{name}", part))
-        elif isinstance(value, types.FunctionType) and is_own(str(value.__module__)):
-            for name, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
-                for part in _read_cell(cell):
-                    if type(part) is _CACHED:
-                        cell.cell_contents = checked(name, part)
+            found = [(str(key), part, functools.partial(value.__setitem__, key)) for key, part in value.items()]
+        elif not is_own(str(getattr(value, "__module__", ""))):
+            continue
+        elif isinstance(value, type):
+            put = functools.partial(type.__setattr__, value)
+            found = [
+                (f"{value.__name__}.{name}", part, functools.partial(put, name)) for name, part in vars(value).items()
+            ]
+        elif isinstance(value, types.FunctionType):
+            cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
+            found = [
+                (name, part, functools.partial(setattr, cell, "cell_contents"))
+                for name, cell in cells
+                for part in _read_cell(cell)
+            ]
+        yield from (each for each in found if type(each[1]) is _CACHED and is_own(str(each[1].__module__)))
 
 
 def _checked(name: str, cached: Any) -> Any:
