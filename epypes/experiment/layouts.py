@@ -1,29 +1,50 @@
-"""Layouts: how the three nodes are spread over processes.
+"""Layouts: how the three nodes are spread over processes, and the processes that run them.
 
-Nodes, functions, graphs, f_in and f_out are the same in all of them. The robot is in the calling process.
+Nodes, functions, graphs, f_in and f_out are the same in all layouts. The robot is in the calling process. Nodes of one
+process are joined by in-process queues, processes by sockets.
+
+A `ChildStation` starts ``python -m epypes.experiment.layouts``. It writes one line of JSON to the standard input of
+the process: the nodes, their settings, and the address of their events. The process runs a `Station`, and writes one
+line of JSON to its standard output: the addresses of its answers and failures. It ends when its standard input is
+closed, which happens however its parent ends, so it never outlives its parent.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import queue
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from epypes.errors import ExperimentError
-from epypes.experiment.components import Settings
-from epypes.experiment.stations import (
-    QUEUE_SIZE,
-    START_TIMEOUT_S,
-    ChildStation,
-    Station,
-    curve_options,
-    new_address,
-)
+from epypes.errors import EpypesError, ExperimentError
+from epypes.experiment.components import COMPONENTS, Settings
+from epypes.experiment.messages import Request, StereoPair
 from epypes.pipeline import Mailbox
-from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.transport import ZMQPublisher, ZMQSubscriber, read_keys
+
+_START_TIMEOUT_S: Final = 30.0
+# Messages that wait while a publisher is not connected: more than ever do, since the robot makes one request at a time.
+_QUEUE_SIZE: Final = 64
+# Longer than what a station waits for inside, whose error says better what was missing.
+_ANSWER_TIMEOUT_S: Final = 3 * _START_TIMEOUT_S
+_STOP_TIMEOUT_S: Final = 5.0
+_PRINTED_CHARACTERS: Final = 100_000
+
+# What the first node of a process takes from its subscriber, and what the last gives to its publisher.
+_FROM_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {"acquisition": Request, "vision": StereoPair.from_envelope}
+_TO_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {"acquisition": StereoPair.to_envelope, "vision": lambda it: it}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +54,7 @@ class Layout:
     Attributes
     ----------
     processes
-        For each process its nodes, in the order in which an event passes them. Nodes of one process are joined by
-        queues, processes by sockets.
+        For each process its nodes, in the order in which an event passes them.
     in_children
         Whether these are processes of their own; otherwise there is one, the caller's.
     """
@@ -50,6 +70,188 @@ LAYOUTS: Final[Mapping[str, Layout]] = MappingProxyType(
         "three": Layout((("acquisition",), ("vision",)), in_children=True),
     }
 )
+
+
+class ConvertingQueue:
+    """The putting end of a queue, which turns every item into something else."""
+
+    def __init__(self, queue: Any, convert: Callable[[Any], Any]) -> None:
+        self._queue, self._convert = queue, convert
+
+    def put(self, item: Any, block: bool = True) -> None:
+        """Convert an item, and put it on the queue."""
+        self._queue.put(self._convert(item), block=block)
+
+
+class Station:
+    """The nodes of one process, with a subscriber before them, a publisher after them, and one for failures.
+
+    Parameters
+    ----------
+    names
+        The nodes in the order in which an event passes them.
+    settings
+        The options of the nodes.
+    scheme
+        ``"tcp"``, or ``"inproc"`` for sockets within this process.
+    """
+
+    def __init__(self, names: Sequence[str], settings: Settings, scheme: str) -> None:
+        self._scheme, self._settings = scheme, settings
+        self._running = contextlib.ExitStack()
+        self._q_in: Any = queue.SimpleQueue()
+        # Mailboxes, whose items are sent by the thread that puts them: no other one has to wake up for that.
+        self._q_out, self._q_failures = Mailbox("drop_oldest", _QUEUE_SIZE), Mailbox("drop_oldest", _QUEUE_SIZE)
+        joints = [
+            self._q_in,
+            *(queue.SimpleQueue() for _ in names[1:]),
+            ConvertingQueue(self._q_out, _TO_SOCKET[names[-1]]),
+        ]
+        self._events = ConvertingQueue(self._q_in, _FROM_SOCKET[names[0]])
+        self.nodes = [
+            COMPONENTS[name](before, after, settings)
+            for name, before, after in zip(names, joints[:-1], joints[1:], strict=True)
+        ]
+        for node in self.nodes:
+            node.on_error = self._q_failures.put
+
+    def start(self, source: str) -> dict[str, str]:
+        """Start everything, and take events from an address; return the addresses of answers and of failures.
+
+        Raises
+        ------
+        AddressError
+            The address can't be connected to.
+        ExperimentError
+            A camera gives no frame, or nothing is published at the address.
+        """
+        enter = self._running.enter_context
+        bound, joined = _curve_options(self._settings, bind=True), _curve_options(self._settings, bind=False)
+        answers = enter(ZMQPublisher(_new_address(self._scheme), self._q_out, **bound))
+        failures = enter(ZMQPublisher(_new_address(self._scheme), self._q_failures, topic="failures", **bound))
+        for node in reversed(self.nodes):
+            enter(node)
+        for node in self.nodes:
+            if not node.wait_until_ready(_START_TIMEOUT_S):
+                raise ExperimentError(node.name, f"The {node.name} node has no images after {_START_TIMEOUT_S:g} s.")
+        subscriber = enter(ZMQSubscriber(source, self._events, **joined))
+        if not subscriber.wait_joined(_START_TIMEOUT_S):
+            raise ExperimentError(self.nodes[0].name, f"Nothing is published at {source}.")
+        return {"answers": answers.address, "failures": failures.address}
+
+    def stop(self) -> None:
+        """Stop everything; may be called twice."""
+        self._running.close()
+
+
+def _curve_options(settings: Settings, *, bind: bool) -> dict[str, Any]:
+    """Return ``keys`` and ``allow`` for a socket of a node: all nodes have one pair, and know each other by it.
+
+    Raises
+    ------
+    KeysError
+        The keys can't be read, or others are allowed without keys.
+    """
+    own = [read_keys(settings.keys)] if settings.keys else []
+    allowed = [*own, *settings.allow] if bind else own
+    return {"keys": own[0] if own else None, "allow": allowed or None}
+
+
+def _new_address(scheme: str) -> str:
+    """Return an address that can be bound: a free port of this machine, or a new name within this process."""
+    return "tcp://127.0.0.1:*" if scheme == "tcp" else f"inproc://epypes-{uuid.uuid4().hex}"
+
+
+class ChildStation:
+    """The nodes of one process, in a process of their own; started and stopped like a Station.
+
+    The process is spawned at once, so that several load their libraries side by side.
+
+    Parameters
+    ----------
+    names
+        The nodes in the order in which an event passes them.
+    settings
+        The options of the nodes.
+    on_end
+        Called with an ExperimentError on a thread of its own, when the process ends and was not asked to.
+    """
+
+    def __init__(self, names: Sequence[str], settings: Settings, on_end: Callable[[ExperimentError], None]) -> None:
+        self.names, self.name, self.addresses = tuple(names), " and ".join(names), {"answers": "", "failures": ""}
+        self._settings, self._on_end, self._stopping = settings, on_end, False
+        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+        # A file takes any amount without a reader, as a pipe does not.
+        self._printed = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by stop()
+        self._process: subprocess.Popen[str] = subprocess.Popen(
+            [sys.executable, "-m", "epypes.experiment.layouts"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._printed,
+            text=True,
+            # Ctrl+C is for this process, which then ends the others in order.
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+        self._stdin: Any = self._process.stdin
+        self._stdout: Any = self._process.stdout
+        self._watcher = threading.Thread(target=self._watch, name=f"epypes {self.name}", daemon=True)
+        self._watcher.start()
+
+    def start(self, source: str) -> dict[str, str]:
+        """Start everything; return the addresses of answers and of failures.
+
+        Raises
+        ------
+        ExperimentError
+            The process has ended, or answers nothing; its last output is in the text.
+        """
+        request = {"nodes": self.names, "settings": asdict(self._settings), "source": source}
+        with contextlib.suppress(OSError):  # the process has ended: its line is empty
+            print(json.dumps(request), file=self._stdin, flush=True)
+        try:
+            line = self._lines.get(timeout=_ANSWER_TIMEOUT_S)
+        except queue.Empty:
+            text = f"The process of {self.name} ({self.pid}) does not start within {_ANSWER_TIMEOUT_S:g} s."
+            raise ExperimentError(self.name, text, self._read_printed()) from None
+        if not line:
+            self._watcher.join()
+            raise self._ended()
+        self.addresses = json.loads(line)
+        return self.addresses
+
+    def stop(self, timeout_s: float = _STOP_TIMEOUT_S) -> None:
+        """Let the process end; it is killed if it takes longer than ``timeout_s``. May be called twice."""
+        self._stopping = True
+        with contextlib.suppress(OSError):
+            self._stdin.close()
+        self._watcher.join(timeout_s)
+        if self._watcher.is_alive():
+            self._process.kill()
+            self._watcher.join()
+        self._stdout.close()
+        self._printed.close()
+
+    def _watch(self) -> None:
+        self._lines.put(self._stdout.readline())
+        self._stdout.read()
+        self._process.wait()
+        if not self._stopping:
+            self._on_end(self._ended())
+
+    def _ended(self) -> ExperimentError:
+        """Return the error for a process that has ended by itself."""
+        status, printed = self._process.returncode, self._read_printed()
+        how = f"ended with exit status {status}" if status >= 0 else f"was ended by {signal.Signals(-status).name}"
+        last = printed.strip().rpartition("\n")[2]
+        text = f"The process of {self.name} ({self.pid}) {how}{': ' + last if last else '.'}"
+        return ExperimentError(self.name, text, printed)
+
+    def _read_printed(self) -> str:
+        return Path(self._printed.name).read_text(encoding="utf-8", errors="replace")[-_PRINTED_CHARACTERS:]
+
+    def __repr__(self) -> str:
+        return f"<ChildStation {self.name}: process {self.pid}>"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +273,7 @@ class System:
     stations: tuple[Station | ChildStation, ...]
 
 
-@contextmanager
+@contextlib.contextmanager
 def running(layout: Layout, settings: Settings) -> Iterator[System]:
     """Run the nodes of a layout while the block runs.
 
@@ -80,12 +282,12 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
     ExperimentError
         A process or a node does not start.
     """
-    requests = Mailbox("drop_oldest", QUEUE_SIZE)
+    requests = Mailbox("drop_oldest", _QUEUE_SIZE)
     inbox: Any = queue.SimpleQueue()
     scheme = "tcp" if layout.in_children else "inproc"
     stations: list[Station | ChildStation] = []
-    with ExitStack() as stack:
-        publisher = ZMQPublisher(new_address(scheme), requests, **curve_options(settings, bind=True))
+    with contextlib.ExitStack() as stack:
+        publisher = ZMQPublisher(_new_address(scheme), requests, **_curve_options(settings, bind=True))
         stack.enter_context(publisher)
         for names in layout.processes:
             in_child = layout.in_children
@@ -97,7 +299,43 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
             source = addresses["answers"]
             failures.append(addresses["failures"])
         for address in (source, *failures):
-            subscriber = stack.enter_context(ZMQSubscriber(address, inbox, **curve_options(settings, bind=False)))
-            if not subscriber.wait_joined(START_TIMEOUT_S):
+            subscriber = stack.enter_context(ZMQSubscriber(address, inbox, **_curve_options(settings, bind=False)))
+            if not subscriber.wait_joined(_START_TIMEOUT_S):
                 raise ExperimentError("robot", f"Nothing is published at {address}.")
         yield System(requests, inbox, tuple(stations))
+
+
+def _run_station() -> None:
+    """Run the nodes that standard input names until it is closed."""
+    # A line that a camera's library prints must not be taken for the answer.
+    answer = os.dup(1)
+    os.dup2(2, 1)
+    # Without a buffer, whose lock the thread below would hold when the interpreter ends.
+    parent = open(0, "rb", buffering=0, closefd=False)  # noqa: SIM115 - until the process ends
+    line = parent.readline()
+    if not line:
+        return
+    request: dict[str, Any] = json.loads(line)
+    has_ended = threading.Event()
+
+    def end_with_parent() -> None:
+        parent.read()
+        has_ended.set()
+        # A camera that does not open may hold the main thread for ever.
+        time.sleep(_STOP_TIMEOUT_S)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, name="epypes parent", daemon=True).start()
+    station = Station(request["nodes"], Settings(**request["settings"]), "tcp")
+    try:
+        os.write(answer, f"{json.dumps(station.start(request['source']))}\n".encode())
+        has_ended.wait()
+    finally:
+        station.stop()
+
+
+if __name__ == "__main__":
+    try:
+        _run_station()
+    except EpypesError as error:
+        sys.exit(f"{type(error).__name__}: {error}")

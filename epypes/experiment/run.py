@@ -11,20 +11,16 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
 from epypes.acquisition.cameras import LAST_DEVICE
-from epypes.errors import ExperimentError, KeysError, MessageError
+from epypes.errors import ExperimentError, MessageError
 from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
 from epypes.experiment.messages import REQUEST, T_VREQ, decode_keypoints
 from epypes.experiment.results import Results, row_of, table_of
-from epypes.transport import read_keys
-from epypes.transport.zeromq.curve import public_keys
 from epypes.wire import Envelope, Event, JustBytes, add_attribute, attributes, parsed
 
-_NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 # Requests that come first and are not counted: they fill caches, and from its fourth run on a graph is compiled.
 _WARM_UP: Final = 5
 # After so many requests in a row without an answer, none is expected any more.
@@ -43,10 +39,8 @@ class Answer:
         From the request to its answer, in seconds, by the robot's clock; nan if there was none.
     attributes
         Of the answer: the time of the request, and the times of both components.
-    contents
-        The bytes of the answer.
     keypoints
-        The matched coordinates in them, float32, (at most 20, 4); None if there was no answer.
+        The matched coordinates in it, float32, (at most 20, 4); None if there was no answer.
     failure
         What failed; empty if nothing did.
     is_missing
@@ -55,8 +49,7 @@ class Answer:
 
     id: str
     t_trip: float = math.nan
-    attributes: Mapping[str, Any] = field(default_factory=lambda: _NOTHING, repr=False)
-    contents: bytes = field(default=b"", repr=False)
+    attributes: Mapping[str, Any] = field(default_factory=dict, repr=False)
     keypoints: Any = field(default=None, repr=False)
     failure: str = ""
     is_missing: bool = False
@@ -136,7 +129,7 @@ class Robot:
             return None
         try:
             keypoints = decode_keypoints(message.contents, unsafe_pickle=self.unsafe_pickle)
-            return Answer(request_id, t_trip, attributes(message), message.contents, keypoints)
+            return Answer(request_id, t_trip, attributes(message), keypoints)
         except MessageError as error:
             return Answer(request_id, failure=f"robot: {error}")
 
@@ -217,10 +210,21 @@ def run_experiment(
     for name, count in {"requests": requests, "experiments": experiments, "workers": workers}.items():
         if type(count) is not int or count < 1:
             raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
-    _check_number("fps", fps)
-    _check_number("timeout_s", timeout_s, threading.TIMEOUT_MAX)
-    guarded = _checked_keys(keys, allow)
-    settings = Settings(_checked_cameras(cameras), float(fps), workers, bool(unsafe_pickle), *guarded)
+    for name, number in {"fps": fps, "timeout_s": timeout_s}.items():
+        if isinstance(number, bool) or not isinstance(number, int | float) or not 0 < number < math.inf:
+            raise ExperimentError(name, f"{name} must be a number above 0, not {number!r}.")
+    if timeout_s > threading.TIMEOUT_MAX:
+        text = f"timeout_s must be at most {threading.TIMEOUT_MAX:.0f}, not {timeout_s!r}."
+        raise ExperimentError("timeout_s", text)
+    settings = Settings(
+        _checked_cameras(cameras),
+        float(fps),
+        workers,
+        bool(unsafe_pickle),
+        # Absolute, for other processes.
+        "" if keys is None else str(Path(keys).absolute()),
+        tuple(str(Path(path).absolute()) for path in allow or ()),
+    )
     rows: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
     for experiment in range(experiments):
@@ -240,24 +244,6 @@ def run_experiment(
                     progress(len(rows), requests * experiments)
         counts += robot.counts
     return Results(layout, table_of(rows), counts)
-
-
-def _check_number(name: str, number: float, most: float = math.inf) -> None:
-    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 < number < math.inf:
-        raise ExperimentError(name, f"{name} must be a number above 0, not {number!r}.")
-    if number > most:
-        raise ExperimentError(name, f"{name} must be at most {most:.0f}, not {number!r}.")
-
-
-def _checked_keys(keys: str | Path | None, allow: Sequence[str | Path] | None) -> tuple[str, tuple[str, ...]]:
-    """Return the files of keys as absolute paths, for other processes."""
-    if keys is None:
-        if allow:
-            raise KeysError("", "allow= was given, but no keys. Give keys= as well: epypes keys makes them.")
-        return "", ()
-    read_keys(keys)
-    public_keys(allow or ())
-    return str(Path(keys).absolute()), tuple(str(Path(path).absolute()) for path in allow or ())
 
 
 def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ...]:

@@ -10,14 +10,14 @@ import sys
 import threading
 import time
 
+import numpy as np
 import psutil
 import pytest
 
 from epypes.errors import ExperimentError, ImageFileError
 from epypes.experiment.components import COMPONENTS, Settings
-from epypes.experiment.layouts import LAYOUTS, running
+from epypes.experiment.layouts import LAYOUTS, ChildStation, running
 from epypes.experiment.run import Robot
-from epypes.experiment.stations import ChildStation
 from epypes.pipeline import FullPipeline
 from epypes.transport import ZMQSubscriber, make_keys
 
@@ -36,7 +36,7 @@ def robot_of(system, timeout_s=TIMEOUT_S) -> Robot:
 def children() -> list[psutil.Process]:
     """Those of the experiment; tests of other things have children, too."""
     found = psutil.Process().children(recursive=True)
-    return [child for child in found if child.is_running() and "epypes.experiment.stations" in _command(child)]
+    return [child for child in found if child.is_running() and "epypes.experiment.layouts" in _command(child)]
 
 
 def _command(child: psutil.Process) -> list[str]:
@@ -55,13 +55,13 @@ def test_the_layouts_are_those_of_the_paper_and_the_two_beside_it():
     assert [name for name, layout in LAYOUTS.items() if not layout.in_children] == ["one"]
 
 
-def test_a_layout_says_nothing_but_which_process_a_node_is_in():
+def test_a_layout_has_nothing_but_the_process_of_each_node():
     assert set(LAYOUTS["paper"].__slots__) == {"processes", "in_children"}
     assert all(name in COMPONENTS for layout in LAYOUTS.values() for names in layout.processes for name in names)
 
 
 @IN_CHILDREN
-def test_nodes_with_keys_know_each_other_and_nobody_else(images, tmp_path):
+def test_nodes_with_keys_know_each_other_and_no_stranger(images, tmp_path):
     own, watcher = make_keys(tmp_path / "own"), make_keys(tmp_path / "watcher")
     settings = Settings(images, fps=50.0, keys=str(tmp_path / "own"), allow=(str(tmp_path / "watcher.key"),))
     with running(LAYOUTS["three"], settings) as system:
@@ -92,14 +92,15 @@ def test_in_one_process_a_request_is_answered(images):
 
 @IN_CHILDREN
 def test_answers_are_the_same_in_every_layout(images):
-    contents = {}
+    keypoints = {}
     for name, layout in LAYOUTS.items():
         with running(layout, settings_of(images)) as system:
             answer = robot_of(system).ask()
             assert answer.failure == ""
-            contents[name] = answer.contents
-    assert contents["paper"] == contents["one"] == contents["three"]
-    assert len(contents["paper"]) > 400
+            keypoints[name] = answer.keypoints
+    assert np.array_equal(keypoints["paper"], keypoints["one"])
+    assert np.array_equal(keypoints["paper"], keypoints["three"])
+    assert keypoints["paper"].shape == (20, 4)
 
 
 @IN_CHILDREN
@@ -165,7 +166,7 @@ def test_a_process_that_hangs_while_it_starts_ends_with_its_parent(end, tmp_path
     pipe = tmp_path / "camera"
     os.mkfifo(pipe)
     code = (
-        "from epypes.experiment.stations import ChildStation\n"
+        "from epypes.experiment.layouts import ChildStation\n"
         "from epypes.experiment.components import Settings\n"
         f"station = ChildStation(['acquisition'], Settings(({str(pipe)!r},) * 2), print)\n"
         "print(station.pid, flush=True); station.start('tcp://127.0.0.1:1')"
@@ -181,18 +182,18 @@ def test_a_process_that_hangs_while_it_starts_ends_with_its_parent(end, tmp_path
 
 
 def opened_by_both(pipe) -> int:
-    """Return a named pipe's end for writing, when somebody has opened it for reading."""
+    """Return a named pipe's end for writing, when another process has opened it for reading."""
     deadline_s = time.monotonic() + TIMEOUT_S
     while True:
         try:
             return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
         except OSError:
-            assert time.monotonic() < deadline_s, "nobody reads"
+            assert time.monotonic() < deadline_s, "no process reads"
             threading.Event().wait(0.02)
 
 
 @IN_CHILDREN
-def test_a_process_that_cannot_start_says_why_in_the_error(tmp_path):
+def test_a_process_that_cannot_start_is_an_error_with_the_reason(tmp_path):
     missing = str(tmp_path / "nothing.png")
     with (
         pytest.raises(ExperimentError, match=r"ended with exit status 1: ImageFileError: .*nothing\.png") as error,
@@ -204,7 +205,7 @@ def test_a_process_that_cannot_start_says_why_in_the_error(tmp_path):
     assert not children()
 
 
-def test_a_camera_that_cannot_be_opened_is_told_at_once_in_one_process(tmp_path):
+def test_a_camera_that_cannot_be_opened_is_an_error_at_once_in_one_process(tmp_path):
     before = set(threading.enumerate())
     with pytest.raises(ImageFileError), running(LAYOUTS["one"], Settings((str(tmp_path / "nothing.png"),) * 2)):
         pass

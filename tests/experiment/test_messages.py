@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -68,15 +69,14 @@ def test_what_is_no_pair_is_refused(item):
 
 
 @pytest.mark.parametrize("rows", [0, 1, 20])
-def test_contents_are_what_numpy_saves(rows):
-    buffer = io.BytesIO()
-    np.save(buffer, KEYPOINTS[:rows])
-    assert encode_keypoints(KEYPOINTS[:rows]) == buffer.getvalue()
-    assert np.array_equal(decode_keypoints(encode_keypoints(KEYPOINTS[:rows])), KEYPOINTS[:rows])
+def test_contents_are_the_coordinates_row_after_row(rows):
+    contents = encode_keypoints(KEYPOINTS[:rows])
+    assert contents == struct.pack(f"<{4 * rows}f", *KEYPOINTS[:rows].flat)
+    assert np.array_equal(decode_keypoints(contents), KEYPOINTS[:rows])
 
 
-def test_contents_of_columns_are_what_numpy_saves():
-    flipped = KEYPOINTS[::-1, ::2]
+def test_contents_of_a_view_are_in_the_order_of_its_rows():
+    flipped = KEYPOINTS[::-1, ::-1]
     assert np.array_equal(decode_keypoints(encode_keypoints(flipped)), flipped)
 
 
@@ -85,7 +85,7 @@ def test_a_pickle_is_read_when_it_is_asked_for_by_its_name():
     assert pickled[:2] == b"\x80\x02", "protocol 2, which any peer reads"
     assert b"numpy.core" in pickled, "where numpy was in 2019"
     assert np.array_equal(decode_keypoints(pickled, unsafe_pickle=True), KEYPOINTS)
-    with pytest.raises(MessageError, match="unsafe_pickle=True alone") as error:
+    with pytest.raises(MessageError, match="The contents are a pickle") as error:
         decode_keypoints(pickled)
     assert error.value.reason == "pickle"
 
@@ -114,7 +114,7 @@ def test_a_poisoned_answer_runs_nothing(tmp_path, disguise):
     assert not canary.exists()
 
 
-@pytest.mark.parametrize("contents", [b"", b"\x93NUMPY", encode_keypoints(KEYPOINTS)[:-1], b"\x80\x02garbage"])
+@pytest.mark.parametrize("contents", [b"\x00", encode_keypoints(KEYPOINTS)[:-1], b"\x80\x02garbage"])
 @pytest.mark.parametrize("unsafe_pickle", [False, True])
 def test_broken_contents_are_refused(contents, unsafe_pickle):
     with pytest.raises(MessageError):
