@@ -206,7 +206,7 @@ def run_checks(
             show = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
             keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
             named = replace(item, name=case.name or item.name)
-            yield Job((named,), (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
+            yield Job(named, (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
 
     for outcomes in run_jobs(runner, jobs(), executor, stop=stop):
         for outcome in outcomes:

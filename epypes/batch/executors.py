@@ -104,9 +104,10 @@ def runs_here(executor: Executor | None) -> bool:
 def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
     for job in jobs:
-        if stop is not None and stop.is_set():
-            return
-        yield run_job(own, job, stop)
+        for outcome in () if stop is not None and stop.is_set() else run_job(own, job):
+            yield [outcome]
+            if stop is not None and stop.is_set():
+                return
 
 
 # -- jobs in flight -------------------------------------------------------------------------------------------------
@@ -178,23 +179,18 @@ def _last_outcomes(backend: _Threads | _Processes, in_flight: dict[Future[Any], 
 
 def _killed(job: Job) -> list[Outcome]:
     info = ErrorInfo("", "KilledWorker", "every worker that ran it died")
-    return [Outcome(item.number, item.name, setting, error_info=info) for item in job.items for setting in job.settings]
+    return [Outcome(job.item.number, job.item.name, setting, error_info=info) for setting in job.settings]
 
 
 def _broken_text(done: int, error: BaseException) -> str:
+    done_text = counted(done, "outcome")
     if isinstance(error, _SubmitRefused):
-        return _closed_text(done, str(error))
+        cause = f"takes no jobs after {done_text}: it was shut down, or its client closed ({error})"
+    else:
+        cause = f"broke after {done_text}, most likely since one of its processes died ({_error_text(error)})"
     return (
-        f"The executor broke after {counted(done, 'outcome')}, most likely since one of its processes died "
-        f"({_error_text(error)}). Make a new one and run again: with store= what was done is taken from there. "
-        "A Dask cluster goes on by itself."
-    )
-
-
-def _closed_text(done: int, reason: str) -> str:
-    return (
-        f"The executor takes no jobs after {counted(done, 'outcome')}: it was shut down, or its client closed "
-        f"({reason}). Make a new one and run again: with store= what was done is taken from there."
+        f"The executor {cause}. Make a new one and run "
+        "again: with store= what was done is taken from there. A Dask cluster replaces its processes itself."
     )
 
 
@@ -220,7 +216,7 @@ def worker_count(executor: Executor) -> int:
     try:
         return max(int(sum(cores().values())), 1)
     except Exception as error:  # a client without a scheduler raises whatever comes first
-        raise ExecutorBroken(0, _closed_text(0, _error_text(error))) from error
+        raise ExecutorBroken(0, _broken_text(0, _SubmitRefused(_error_text(error)))) from error
 
 
 def _submitted(executor: Executor, call: Callable[..., Any], argument: object) -> Future[Any]:
@@ -264,8 +260,13 @@ class _Threads:
     def _run(self, job: Job) -> list[Outcome]:
         if self._stop is not None and self._stop.is_set():
             return []
+        outcomes: list[Outcome] = []
         with self._runners.runner() as own:
-            return run_job(own, job, self._over)
+            for outcome in run_job(own, job):
+                outcomes.append(outcome)
+                if self._over.is_set():
+                    break
+        return outcomes
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""
@@ -296,7 +297,7 @@ class _Processes:
         package = self._package = self._package or known_package(self._runner) or self._proven(job)
         if package is None:
             here: Future[Any] = Future()
-            here.set_result(run_job(clone_runner(self._runner), job))
+            here.set_result(list(run_job(clone_runner(self._runner), job)))
             return here
         if package.size > _MOST_SENT_BYTES and not with_files:
             package = replace(package, files=None)
@@ -306,15 +307,13 @@ class _Processes:
         return _submitted(self._executor, run_packaged_job, packaged)
 
     def _proven(self, job: Job) -> PackagedGraph | None:
-        """Return the package that the first item proves which can be run; None if none can."""
-        for item in job.items:
-            own = clone_runner(self._runner)
-            try:
-                own.run_on(payload_of(item, own.cg))
-            except (Exception, SystemExit):  # noqa: S112 - whatever a function raises: it will be that item's failure
-                continue
-            return package_of(own)
-        return None
+        """Return the package that a run of the job's item proves; None if it can't be run."""
+        own = clone_runner(self._runner)
+        try:
+            own.run_on(payload_of(job.item, own.cg))
+        except (Exception, SystemExit):  # whatever a function raises: it will be that item's failure
+            return None
+        return package_of(own)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job that came back."""

@@ -1,4 +1,4 @@
-"""Jobs: items and settings that one worker runs, and how it runs them."""
+"""Jobs: an item and the settings with which one worker runs it, and how it runs them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ NO_SETTING: Final[Setting] = {}
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Items that one worker runs, one after another.
+    """An item that one worker runs with some settings, one after another.
 
     Attributes
     ----------
-    items
-        The inputs.
+    item
+        The input.
     settings
-        Hyperparameters by token; each item is run with all of them, in this order.
+        Hyperparameters by token; the item is run with all of them, in this order.
     keep
         Tokens whose values are kept.
     show
@@ -45,7 +45,7 @@ class Job:
         Tokens; only what they need is run, branches that are not chosen too. Everything without.
     """
 
-    items: tuple[Item, ...]
+    item: Item
     settings: tuple[Setting, ...] = (NO_SETTING,)
     keep: tuple[str, ...] = ()
     show: tuple[str, ...] | None = ()
@@ -53,34 +53,19 @@ class Job:
     targets: tuple[str, ...] = ()
 
 
-def run_job(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
-    """Return the outcomes of a job: item by item, setting by setting.
+def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
+    """Yield the outcomes of a job, setting by setting.
 
     Parameters
     ----------
     runner
         One that no other thread uses; it has its hyperparameters again afterwards.
     job
-        The items and settings. Of the second setting on only what depends on what changed is run.
-    stop
-        Once it is set, the item that is being run is the last one.
+        The item and its settings. Of the second setting on only what depends on what changed is run.
     """
-    before = dict(runner.hyperparameters)
+    item, before = job.item, dict(runner.hyperparameters)
     # A setting may leave out what another one has: that is then as it was.
     varied = {token: before[token] for setting in job.settings for token in setting if token in before}
-    outcomes: list[Outcome] = []
-    try:
-        for item in job.items:
-            for outcome in _of_item(runner, item, job, varied):
-                outcomes.append(outcome)
-                if stop is not None and stop.is_set():
-                    return outcomes
-    finally:
-        runner.set(**varied)
-    return outcomes
-
-
-def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> Iterator[Outcome]:
     album = Album() if job.start is None else job.start.album
     waiting, begun = deque(job.settings), list[Outcome]()
 
@@ -106,12 +91,15 @@ def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> 
             begun.append(outcome_of(runner, payload))
         return None if runner.last is before else runner
 
-    own = begin() if job.start is None else job.start.branch(begin)
-    yield from begun
-    while own is not None and waiting:
-        yield outcome_of(own, None)
-    if own is not None and job.start is not None:
-        job.start.move_to(own)
+    try:
+        own = begin() if job.start is None else job.start.branch(begin)
+        yield from begun
+        while own is not None and waiting:
+            yield outcome_of(own, None)
+        if own is not None and job.start is not None:
+            job.start.move_to(own)
+    finally:
+        runner.set(**varied)
 
 
 def _run(

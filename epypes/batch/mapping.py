@@ -154,7 +154,7 @@ def map_images(
         collector = OutcomeCollector(cache, advance)
         items = items_of(images, runner, is_copied=executor is not None or cache is not None or bool(keep))
         shown = None if show is None else tuple(show)
-        jobs = (Job((item,), keep=tuple(keep), show=shown) for item in collector.missing_items(items))
+        jobs = (Job(item, keep=tuple(keep), show=shown) for item in collector.missing_items(items))
         for outcomes in run_jobs(runner, jobs, executor, ahead=ahead):
             collector.add(outcomes)
     return MapResult(runner.cg, sorted(collector.outcomes, key=lambda outcome: outcome.number))

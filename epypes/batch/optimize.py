@@ -205,7 +205,7 @@ class _Evaluation:
                         break
                     marked = replace(item, number=number * len(starts) + index)
                     setting = {**one.setting, **(case.hyperparameters or {})}
-                    yield Job((marked,), (setting,), keep=keep, start=starts[index], targets=keep)
+                    yield Job(marked, (setting,), keep=keep, start=starts[index], targets=keep)
 
         ahead = None if self.executor is None else worker_count(self.executor)
         for [outcome] in filter(None, run_jobs(self.runner, jobs(), self.executor, ahead=ahead, stop=self.stop)):

@@ -194,31 +194,31 @@ def unpacked_values(values: Mapping[str, Any], enums: Mapping[str, Any] | None =
 
 def packed_job(job: Job) -> Job:
     """Return a job as it travels: without where it starts, since that has a lock and a runner of this process."""
-    items = tuple(replace(item, payload=packed_values(item.payload, "Input")) for item in job.items)
+    item = replace(job.item, payload=packed_values(job.item.payload, "Input"))
     settings = tuple(packed_values(setting, "Hyperparameter") for setting in job.settings)
-    return replace(job, items=items, settings=settings, start=None)
+    return replace(job, item=item, settings=settings, start=None)
 
 
 def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:
     """Return the job that ``packed_job`` packed."""
-    items = tuple(replace(item, payload=unpacked_values(item.payload)) for item in job.items)
-    return replace(job, items=items, settings=tuple(unpacked_values(setting, enums) for setting in job.settings))
+    item = replace(job.item, payload=unpacked_values(job.item.payload))
+    return replace(job, item=item, settings=tuple(unpacked_values(setting, enums) for setting in job.settings))
 
 
-def packed_outcomes(outcomes: list[Outcome]) -> list[Outcome]:
-    """Return outcomes as they travel back: without their settings, which the process that sent the job has."""
-    return [replace(outcome, setting={}, kept=packed_values(outcome.kept, "Token")) for outcome in outcomes]
+def packed_outcome(outcome: Outcome) -> Outcome:
+    """Return an outcome as it travels back: without its setting, which the process that sent the job has."""
+    return replace(outcome, setting={}, kept=packed_values(outcome.kept, "Token"))
 
 
 def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
     """Return the outcomes of a job that came back; their arrays are read-only, as those of a run are."""
     unpacked: list[Outcome] = []
-    for place, outcome in enumerate(outcomes):
+    for outcome, setting in zip(outcomes, job.settings, strict=True):
         kept = unpacked_values(outcome.kept)
         for value in kept.values():
             if is_plain_array(value):
                 value.flags.writeable = False
-        unpacked.append(replace(outcome, setting=job.settings[place % len(job.settings)], kept=kept))
+        unpacked.append(replace(outcome, setting=setting, kept=kept))
     return unpacked
 
 
@@ -278,7 +278,7 @@ class _LoadedGraph:
         """Run a job, on a runner that no other thread uses meanwhile."""
         with self._runners.runner() as own:
             own.set(**unpacked_values(packaged.hyperparameters, self._enums))
-            return run_job(own, unpacked_job(packaged.job, self._enums))
+            return list(run_job(own, unpacked_job(packaged.job, self._enums)))
 
 
 _LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _LoadedGraph]] = OrderedDict()
@@ -301,7 +301,7 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | WorkerRefusal:
             while len(_LOADED) > _MOST_LOADED:
                 _LOADED.popitem(last=False)
     try:
-        return packed_outcomes(loaded.run(packaged))
+        return [packed_outcome(outcome) for outcome in loaded.run(packaged)]
     except ScaleError as error:
         return WorkerRefusal(str(error))
 

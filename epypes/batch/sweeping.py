@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -195,8 +196,8 @@ def sweep(
         collector = OutcomeCollector(cache, advance)
         is_copied = executor is not None or cache is not None or bool(kept)
         items = _items(given, images, plan, is_copied=is_copied)
-        grid_job = Job((), in_order, kept, shown)
-        for outcomes in run_jobs(runner, _jobs(runner, grid_job, items, collector, executor, count), executor):
+        make = partial(Job, keep=kept, show=shown)
+        for outcomes in run_jobs(runner, _jobs(runner, make, in_order, items, collector, executor, count), executor):
             collector.add(outcomes)
     found = sorted(collector.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
     return SweepResult(tuple(found), plan.names, given)
@@ -204,7 +205,8 @@ def sweep(
 
 def _jobs(
     runner: CompGraphRunner,
-    grid_job: Job,
+    make: Callable[..., Job],
+    in_order: tuple[Setting, ...],
     items: Iterator[Item],
     collector: OutcomeCollector,
     executor: Executor | None,
@@ -212,11 +214,11 @@ def _jobs(
 ) -> Iterator[Job]:
     """Yield the jobs of each item: its settings in parts, which in this process share the item's first run."""
     for item in items:
-        settings = collector.missing_settings(item, grid_job.settings)
+        settings = collector.missing_settings(item, in_order)
         cuts = _cuts(runner, settings, executor, images) if settings else []
         start = SharedStart() if len(cuts) > 2 and runs_here(executor) else None
         for first, end in pairwise(cuts):
-            yield replace(grid_job, items=(item,), settings=settings[first:end], start=start)
+            yield make(item, settings[first:end], start=start)
         # This generator waits for its caller, and must not keep the item alive meanwhile.
         del item, start
 

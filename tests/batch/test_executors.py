@@ -70,7 +70,7 @@ def test_results_are_the_same_on_every_executor(who, runner, crops, folder, requ
 
 def test_settings_are_the_same_in_this_thread_and_in_processes(runner, crops, processes):
     settings = tuple({"canny_lo": low} for low in (10, 60, 120))
-    jobs = [Job((item,), settings) for item in items_of(crops[:3], runner)]
+    jobs = [Job(item, settings) for item in items_of(crops[:3], runner)]
     expected = [outcome for outcomes in run_jobs(runner, jobs) for outcome in outcomes]
     found = [outcome for outcomes in run_jobs(runner, jobs, processes) for outcome in outcomes]
     found.sort(key=lambda outcome: (outcome.number, outcome.setting["canny_lo"]))
@@ -80,7 +80,7 @@ def test_settings_are_the_same_in_this_thread_and_in_processes(runner, crops, pr
 
 def test_where_a_job_starts_stays_in_this_process(runner, crops, processes):
     (item,) = items_of(crops[:1], runner)
-    jobs = [Job((item,), ({"canny_lo": low},), start=start) for start in [SharedStart()] for low in (10, 60)]
+    jobs = [Job(item, ({"canny_lo": low},), start=start) for start in [SharedStart()] for low in (10, 60)]
 
     def pixels(executor):
         outcomes = [outcome for outcomes in run_jobs(runner, jobs, executor) for outcome in outcomes]
@@ -112,7 +112,7 @@ def test_members_of_the_notebooks_enumerations_travel(processes, crops):
     runner = ep.CompGraphRunner(cg, {"side": made["Side"].LEFT})
     assert issubclass(made["Side"], enum.Enum)
     (item,) = items_of(crops[:1], runner)
-    job = Job((item,), ({}, {"side": made["Side"].RIGHT}))
+    job = Job(item, ({}, {"side": made["Side"].RIGHT}))
     ((left, right),) = run_jobs(runner, [job], processes)
     assert left.values["brightness"] == float(crops[0][:, :75].mean())
     assert right.values["brightness"] == float(crops[0][:, 75:].mean())
@@ -341,7 +341,7 @@ class Gate:
 
 def many_jobs(runner) -> Iterator[Job]:
     for item in items_of(iter(range(1000)), runner):
-        yield Job((item,))
+        yield Job(item)
 
 
 def test_a_stop_ends_it_and_leaves_nothing_queued():
@@ -370,8 +370,8 @@ def test_a_stop_in_this_thread_ends_after_the_item():
         return int(image)
 
     runner = ep.CompGraphRunner(ep.CompGraph({"note": note}, {"note": ("image", "out")}))
-    (outcomes,) = run_jobs(runner, [Job(tuple(items_of(range(10), runner)))], stop=stop)
-    assert [outcome.values["out"] for outcome in outcomes] == [0, 1, 2]
+    found = run_jobs(runner, (Job(item) for item in items_of(range(10), runner)), stop=stop)
+    assert [outcome.values["out"] for outcomes in found for outcome in outcomes] == [0, 1, 2]
 
 
 def test_closing_the_outcomes_leaves_nothing_queued():

@@ -17,6 +17,11 @@ from epypes.batch.packaged_graph import packed_job, unpacked_job
 from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, outcomes_frame
 
 
+def ran(runner, *jobs):
+    """Return the outcomes of jobs."""
+    return [outcome for job in jobs for outcome in run_job(runner, job)]
+
+
 @pytest.fixture
 def calls():
     return Counter()
@@ -44,8 +49,8 @@ def counted(calls):
 
 
 def test_only_what_the_targets_need_is_run(counted, calls):
-    job = Job((item(),), ({"offset": -1}, {"offset": -2}), keep=("doubled", "total"), targets=("doubled",))
-    outcomes = run_job(counted, job)
+    job = Job(item(), ({"offset": -1}, {"offset": -2}), keep=("doubled", "total"), targets=("doubled",))
+    outcomes = ran(counted, job)
     assert calls == {"double": 1}
     assert [(list(outcome.kept), outcome.values, outcome.error_info) for outcome in outcomes] == [
         (["doubled"], {}, None)
@@ -63,20 +68,20 @@ def totals(outcomes):
 
 def test_functions_that_do_not_depend_on_what_varies_run_once_per_item(counted, calls):
     settings = tuple({"offset": offset} for offset in range(10))
-    outcomes = run_job(counted, Job((item(0), item(1)), settings))
+    outcomes = ran(counted, *(Job(item(number), settings) for number in (0, 1)))
     assert totals(outcomes) == [8 + offset for offset in range(10)] + [16 + offset for offset in range(10)]
     assert calls == {"double": 2, "add": 20}
     assert [set(outcome.times_ns) for outcome in outcomes[:2]] == [{"double", "add"}, {"add"}]
 
 
 def test_what_a_setting_leaves_out_is_as_the_runner_has_it(counted):
-    outcomes = run_job(counted, Job((item(),), ({"limit": 5}, {"offset": 1}, {"limit": 3})))
+    outcomes = ran(counted, Job(item(), ({"limit": 5}, {"offset": 1}, {"limit": 3})))
     assert totals(outcomes) == [5, 9, 3]
     assert counted.hyperparameters == {"offset": 0, "limit": 1000}
 
 
 def test_a_setting_that_fails_leaves_the_others_alone(counted, calls):
-    good, bad, again = run_job(counted, Job((item(),), ({}, {"offset": -1}, {"offset": 2})))
+    good, bad, again = ran(counted, Job(item(), ({}, {"offset": -1}, {"offset": 2})))
     assert bad.error_info == ErrorInfo("add", "ValueError", "offset is negative")
     assert bad.values == {}
     assert totals([good, again]) == [8, 10]
@@ -84,14 +89,14 @@ def test_a_setting_that_fails_leaves_the_others_alone(counted, calls):
 
 
 def test_a_first_setting_that_fails_leaves_the_others_alone(counted):
-    bad, good = run_job(counted, Job((item(),), ({"offset": -1}, {"offset": 2})))
+    bad, good = ran(counted, Job(item(), ({"offset": -1}, {"offset": 2})))
     assert bad.has_failed
     assert totals([good]) == [10]
 
 
-def test_an_input_that_can_not_be_read_is_trouble_without_a_function(runner):
+def test_an_input_that_can_not_be_read_is_a_failure_without_a_function(runner):
     (found,) = items_of(["nowhere.png"], runner)
-    first, second = run_job(runner, Job((found,), ({"canny_lo": 1}, {"canny_lo": 2})))
+    first, second = ran(runner, Job(found, ({"canny_lo": 1}, {"canny_lo": 2})))
     assert first.error_info.function == ""
     assert first.error_info.kind == "ImageFileError"
     assert second.setting == {"canny_lo": 2}
@@ -102,7 +107,7 @@ def test_a_function_that_leaves_the_interpreter_is_a_failure_of_its_item():
         raise SystemExit(3)
 
     runner = ep.CompGraphRunner(ep.CompGraph({"leave": leave}, {"leave": ("image", "out")}))
-    (outcome,) = run_job(runner, Job((item(),)))
+    (outcome,) = ran(runner, Job(item()))
     assert outcome.error_info.kind == "SystemExit"
 
 
@@ -119,7 +124,7 @@ def test_numbers_texts_and_truth_values_stay_and_others_become_a_short_text(crop
         {f"make_{name}": lambda image, value=value: value for name, value in kinds.items()},
         {f"make_{name}": (("image",), name) for name in kinds},
     )
-    (outcome,) = run_job(ep.CompGraphRunner(cg), Job((item(),)))
+    (outcome,) = ran(ep.CompGraphRunner(cg), Job(item()))
     assert outcome.values == {
         "count": 3, "share": 0.5, "is_good": True, "text": "ok", "none": None, "pixels": "uint8 100 x 150 x 3 bgr",
     }  # fmt: skip
@@ -127,10 +132,10 @@ def test_numbers_texts_and_truth_values_stay_and_others_become_a_short_text(crop
 
 
 def test_only_tokens_that_are_asked_for_are_kept_and_shown(runner, crops):
-    (plain,) = run_job(runner, Job((Item(0, "#0", {"image": crops[0]}),)))
+    (plain,) = ran(runner, Job(Item(0, "#0", {"image": crops[0]})))
     assert plain.kept == {}
     assert plain.thumbnails == {}
-    (seen,) = run_job(runner, Job((Item(0, "#0", {"image": crops[0]}),), keep=("edges",), show=None))
+    (seen,) = ran(runner, Job(Item(0, "#0", {"image": crops[0]}), keep=("edges",), show=None))
     assert seen.kept["edges"].shape == (100, 150)
     assert {"image", "image_gray", "edges", "keypoints"} == set(seen.thumbnails)
     assert all(len(shown.data) <= 5 * 1024 for shown in seen.thumbnails.values())
@@ -138,7 +143,7 @@ def test_only_tokens_that_are_asked_for_are_kept_and_shown(runner, crops):
 
 def test_a_chart_is_kept_as_a_picture_that_stands_alone():
     cg = ep.CompGraph({"profile": lambda image: np.linspace(0, 1, 50)}, {"profile": ("image", "curve")})
-    (outcome,) = run_job(ep.CompGraphRunner(cg), Job((item(),), show=("curve",)))
+    (outcome,) = ran(ep.CompGraphRunner(cg), Job(item(), show=("curve",)))
     shown = outcome.thumbnails["curve"]
     assert shown.media_type == "image/svg+xml"
     assert b"<svg xmlns" in shown.data
@@ -156,7 +161,7 @@ def test_an_outcome_comes_back_from_json_as_it_was():
 
 
 def test_the_table_has_failures_as_rows_and_whole_numbers_stay_whole(counted):
-    frame = outcomes_frame(run_job(counted, Job((item(),), ({}, {"offset": -1}))), counted.cg, {"offset": [0, -1]})
+    frame = outcomes_frame(ran(counted, Job(item(), ({}, {"offset": -1}))), counted.cg, {"offset": [0, -1]})
     assert list(frame.columns) == ["name", "offset", "failure", "total", "total_ms", "double ms", "add ms"]
     assert frame["total"].tolist()[0] == 8
     assert frame["total"].isna().tolist() == [False, True]
@@ -166,7 +171,7 @@ def test_the_table_has_failures_as_rows_and_whole_numbers_stay_whole(counted):
 
 def test_a_token_that_is_called_like_a_column_has_another_name():
     cg = ep.CompGraph({"f": lambda image: 1}, {"f": ("image", "name")})
-    frame = outcomes_frame(run_job(ep.CompGraphRunner(cg), Job((item(),))), cg)
+    frame = outcomes_frame(ran(ep.CompGraphRunner(cg), Job(item())), cg)
     assert frame["name (token)"].tolist() == [1]
     assert frame["name"].tolist() == ["#0"]
 
