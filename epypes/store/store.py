@@ -35,6 +35,13 @@ class Store:
         The path of a SQLite file, made if it is not there, or the URL of a database as SQLAlchemy writes it:
         ``"postgresql://user:password@host/database"``.
 
+    Attributes
+    ----------
+    place
+        The path, or the URL without its password.
+    url
+        The URL with its password, for another library that is to use the same database.
+
     Raises
     ------
     StoreError
@@ -53,17 +60,10 @@ class Store:
         with optional_import():
             from epypes.store.database import Database
         self.database = Database(place)
+        self.place = self.database.place
+        self.url: URL = self.database.engine.url
+        # Connects, and makes the tables.
         self.database.series_names()
-
-    @property
-    def place(self) -> str:
-        """The path, or the URL without its password."""
-        return self.database.place
-
-    @property
-    def url(self) -> URL:
-        """The URL with its password, for another library that is to use the same database."""
-        return self.database.engine.url
 
     def series(self, kind: str, name: str, *, about: Mapping[str, Any] | None = None) -> Series:
         """Return the series of a kind and a name.
