@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from epypes.cli.options import PATH, allow_option, keys_option, seconds_option
+from epypes.cli.options import PATH, seconds_option
 from epypes.cli.terminal import print_table
 from epypes.errors import ExperimentError
 
@@ -38,8 +38,6 @@ _COLUMNS: Final = {
 @click.option("--camera", multiple=True, help="Image, folder, video or device number; twice. Default: a stereo pair.")
 @seconds_option("--timeout", 5.0, "Longest wait for one answer")
 @click.option("--unsafe-pickle", is_flag=True, help="Send and read pickled contents, as in 2019.")
-@keys_option
-@allow_option
 @click.option("--out", "to", type=PATH, help="Folder for requests.csv and Figures 14, 15 and 16 as SVG.")
 def experiment(layout: str, workers: int, camera: Sequence[str], to: Path | None, **options: Any) -> None:
     """Run the experiment of the paper.

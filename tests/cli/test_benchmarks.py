@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
-from epypes.experiment.messages import decode_keypoints
+from epypes.experiment.nodes import Settings, decode_keypoints
 from epypes.experiment.run import Robot
 from epypes.wire import attributes
 from tests.apart import apart
