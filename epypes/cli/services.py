@@ -13,6 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from threading import TIMEOUT_MAX
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, TextIO, cast
 
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 _ANY_PORT: Final = "tcp://127.0.0.1:*"
 _DIGITS: Final = 12
-# The kernel takes a C int.
-_MAX_POLL_MS: Final = 2**31 - 1
 
 _http_option: Final = click.option(
     "--http", default="", show_default=False, help="URL of the service, as http://127.0.0.1:8642."
@@ -192,22 +191,18 @@ def stop(source: str, timeout_s: float, replica: str) -> None:
     All services of the bundle that this user runs here are ended, or the replica that is named, as by SIGTERM.
     """
     states = states_of(source, replica)
-    end_s = monotonic() + timeout_s
+    end_s = monotonic() + min(timeout_s, TIMEOUT_MAX)
+    late = []
     with ExitStack() as opened:
-        processes = [(state, _terminate(source, state, opened)) for state in states]
-        late = []
-        for state, process in processes:
-            if process is not None and not _wait_for_end(process, max(end_s - monotonic(), 0.0)):
-                late.append(_describe_process(source, state))
-                continue
-            named = f", replica {state.replica}" if state.replica else ""
-            click.echo(f"STOPPED {source}{named}, process {state.pid}.")
+        # All are ended before the first is waited for.
+        for state, process in [(state, _terminate(source, state, opened)) for state in states]:
+            if process is None or select.select([process], [], [], max(end_s - monotonic(), 0.0))[0]:
+                named = f", replica {state.replica}" if state.replica else ""
+                click.echo(f"STOPPED {source}{named}, process {state.pid}.")
+            else:
+                late.append(f"Process {state.pid}, which serves {source},")
     if late:
         raise ServiceError(source, f"{' '.join(late)} has not ended within {timeout_s:g} s. Wait longer: --timeout.")
-
-
-def _describe_process(source: str, state: ServiceState) -> str:
-    return f"Process {state.pid}, which serves {source},"
 
 
 def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | None:
@@ -222,15 +217,9 @@ def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | Non
     except ProcessLookupError:
         return None
     except OSError as error:
-        text = f"{_describe_process(source, state)} can't be ended: {error.strerror}."
+        text = f"Process {state.pid}, which serves {source}, can't be ended: {error.strerror}."
         raise ServiceError(source, text) from error
     return process
-
-
-def _wait_for_end(process: int, timeout_s: float) -> bool:
-    poll = select.poll()
-    poll.register(process, select.POLLIN)
-    return bool(poll.poll(min(timeout_s * 1000, _MAX_POLL_MS)))
 
 
 @click.command("set")
