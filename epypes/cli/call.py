@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from epypes.cli.bundles import run_promotion
-from epypes.cli.options import PATH, allow_option, bundle_argument, json_option, keys_option, seconds_option
+from epypes.cli.options import PATH, allow_option, bundle_argument, keys_option, seconds_option
 from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError, UnknownName
 
@@ -34,7 +34,7 @@ _address_option: Final = functools.partial(
     click.option,
     default="",
     show_default=False,
-    help="The address given to epypes serve; if a broker wants a password.",
+    help="Address that epypes serve was given; needed if the broker has a password.",
 )
 
 
@@ -48,7 +48,7 @@ _address_option: Final = functools.partial(
 )
 @seconds_option("--timeout", 10.0, "Longest wait for the answer", least=0.001)
 @click.option("--count", type=click.IntRange(1), default=1, help="Number of calls; the times are those of the fastest.")
-@json_option
+@click.option("--json", "as_json", is_flag=True, help="Print the times as JSON, in nanoseconds.")
 @keys_option
 @allow_option
 @_address_option("--sub")
@@ -56,7 +56,7 @@ _address_option: Final = functools.partial(
 def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as_json: bool, **options: Any) -> None:
     """Send an image to a service, and write its answer to a file.
 
-    Or other values: one for each input token. An answer without a file is printed.
+    A service with several input tokens needs one value for each. An answer without --out is printed.
     """
     from epypes.bundle.load import SETTINGS
     from epypes.bundle.manifest import check_manifest

@@ -114,7 +114,10 @@ def export() -> None:
 @click.option("--to", type=PATH, help="File, or folder for it; default: standard output.")
 @click.option("--user", default=getpass.getuser, show_default="you", help="User that runs the service.")
 def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) -> None:
-    """Write a unit by which systemd starts the service at boot, and again when it ends."""
+    """Write a systemd unit for the service.
+
+    systemd then starts the service at boot, and restarts it when it ends.
+    """
     from epypes.service.ops.export import systemd_unit, unit_name
 
     _check_serve_options(bundle, options)
@@ -135,7 +138,10 @@ def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) ->
 @_serve_options
 @click.option("--to", type=PATH, required=True, help="Folder to write; it must not exist yet.")
 def docker(bundle: Path, options: Sequence[str], to: Path) -> None:
-    """Write a folder from which docker or podman builds the service: container file, requirements, bundle."""
+    """Write a build folder for docker or podman.
+
+    It has a container file, the requirements and the bundle.
+    """
     from epypes.service.ops.export import write_container
 
     _check_serve_options(bundle, options)

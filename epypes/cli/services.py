@@ -134,7 +134,7 @@ def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **o
 
     A broker's address is amqp://, nats:// or mqtt://[USER@]HOST/NAME.
 
-    Its password is in a file, which ?password_file=PATH names: lists of processes show addresses.
+    Its password is read from a file, ?password_file=PATH, since process lists show addresses.
 
     More options follow with & (quote the address): create=true, attempts=3, dead=NAME, group=NAME, kind=broadcast,
     vhost=NAME, ca=FILE.
@@ -186,9 +186,9 @@ def _print_ready(bundle: Path, state: ServiceState) -> None:
 @seconds_option("--timeout", 30.0, "Longest wait for its end")
 @replica_option
 def stop(source: str, timeout_s: float, replica: str) -> None:
-    """End a running service; accepted events are answered first.
+    """Stop a running service; accepted events are answered first.
 
-    All services of the bundle that this user runs here are ended, or the replica that is named, as by SIGTERM.
+    SIGTERM goes to all services of the bundle that this user runs on this machine, or to one named replica.
     """
     states = states_of(source, replica)
     end_s = monotonic() + min(timeout_s, TIMEOUT_MAX)
@@ -230,8 +230,8 @@ def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | Non
 def set_parameters(source: str, values: Sequence[str], token_file: Path | None, replica: str) -> None:
     """Set hyperparameters of a running service.
 
-    They change between two events, all or none. Replicas that share a queue follow the one that is set. epypes deploy
-    forgets them.
+    All values change together, between two events. Replicas that share a queue take them over. epypes deploy resets
+    them.
     """
     wanted = dict(_parse_assignment(text) for text in values)
     with connect_to(source, token_file, replica) as service:
@@ -259,7 +259,7 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
 @_service_option
 @token_file_option
 def deploy(bundle: Path, http: str, service: str, token_file: Path | None) -> None:
-    """Have a running service serve another bundle.
+    """Deploy another bundle to a running service.
 
     The service replays the bundle first; if it computes something else, the service keeps the old one.
     """
@@ -274,7 +274,7 @@ def deploy(bundle: Path, http: str, service: str, token_file: Path | None) -> No
 @_service_option
 @token_file_option
 def rollback(http: str, service: str, token_file: Path | None) -> None:
-    """Have a running service serve the previous bundle again.
+    """Return a running service to its previous bundle.
 
     A second rollback returns to the bundle before the first.
     """

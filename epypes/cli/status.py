@@ -33,8 +33,8 @@ Info = dict[str, Any]
 def status(source: str, as_json: bool, replica: str) -> None:
     """Show the state of a running service.
 
-    Also its addresses, its counts of events and its parameters; and the replicas that share its events, unless one is
-    named.
+    The output has its addresses, event counts and parameters, and all replicas that share its events. With --replica
+    it describes one replica.
     """
     if is_url(source):
         services = [_ask(source)]
