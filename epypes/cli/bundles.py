@@ -28,9 +28,9 @@ _MAX_ROWS: Final = 100
 @click.option("--output", multiple=True, help="Token of the service's answers; may be repeated.")
 @click.option("--sample", multiple=True, help="Variable with a further payload, or a list of them; may be repeated.")
 def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: Sequence[str]) -> None:
-    """Execute a notebook, write its graph as a bundle, and verify it.
+    """Write the graph of a notebook as a bundle, and verify it.
 
-    The bundle is replayed in a fresh process, and must compute what the notebook computed.
+    The notebook is executed in a new kernel. The bundle is replayed in a fresh process, and must compute the same.
     """
     run_promotion(notebook, to, name, output, sample)
     click.echo(f"Promoted {name!r} of {notebook} to {to}: replayed identical in a fresh process.")

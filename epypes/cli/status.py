@@ -16,6 +16,10 @@ from epypes.errors import EpypesError
 if TYPE_CHECKING:
     from epypes.service.state_file import ServiceState
 
+_COUNTS: Final = (
+    *("received", "answered", "failed", "dropped", "waiting"),
+    *("dead_letters", "redelivered", "duplicates", "given_back"),
+)
 _NO_GROUP: Final[dict[str, Any]] = {"members": [], "lost": [], "trouble": ""}
 # The state of a service that can't be asked, since it has no HTTP control.
 _UNKNOWN: Final = "RUNNING"
@@ -110,7 +114,7 @@ def _describe_bundle(service: Info) -> str:
 
 
 def _print_counts(counts: dict[str, int]) -> None:
-    texts = (f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
+    texts = (f"{counts[name]} {name.replace('_', ' ')}" for name in _COUNTS if name in counts)
     click.echo(f"Events: {', '.join(texts)}.")
 
 
