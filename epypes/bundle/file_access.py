@@ -132,18 +132,22 @@ def named_here(folder: Path) -> list[str]:
 
 
 def _texts_of(folder: Path) -> Iterator[_Named]:
-    """Give the strings in a bundle's module, but for those that nothing reads, as docstrings."""
+    """Give the strings in a bundle's module with the function that has each; not those that nothing reads."""
     module = folder / "pipeline.py"
     try:
         tree = ast.parse(module.read_bytes())
     except (OSError, SyntaxError, ValueError):
         return
+    functions: dict[ast.AST, str] = {}
+    for node in ast.walk(tree):  # a function before the functions in it
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            functions |= dict.fromkeys(ast.walk(node), f"{node.name}()")
     unread = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
         if not isinstance(node, ast.Constant) or node in unread or not isinstance(node.value, str):
             continue
         if len(node.value) <= _LONGEST and node.value.isprintable():
-            yield node.value, f"The module ({module.name}, line {node.lineno})"
+            yield node.value, f"{functions.get(node, 'The module')} ({module.name}, line {node.lineno})"
 
 
 def _texts_in(value: Any) -> Iterator[str]:
