@@ -1,8 +1,9 @@
-"""What a bundle computes depends on its tokens alone: the conditions under which that is tried, and what is watched.
+"""The proof of a draft: replays under usual and other conditions, and what the differences between them mean.
 
-A replay under another condition shows what depends on it. A relative path is found by another working folder. For
-absolute ones, an audit hook receives every file that Python opens. Libraries in C open files without it, so their names
-are looked for in the text of the module and in the values of hyperparameters.
+Two processes replay at the same time, each every sample twice. One of them has the usual conditions, in the other all
+of them are others: what the surroundings of a process may change, and nothing that a bundle computes. Where a token
+differs, replays with one other condition each find the one that changes it. Floats that differ by noise alone get a
+tolerance.
 """
 
 from __future__ import annotations
@@ -11,28 +12,35 @@ import ast
 import os
 import re
 import subprocess
-import sys
-import sysconfig
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from types import FrameType
-from typing import Any, Final, Self
+from typing import Final
 
+from epypes.bundle.adapters import ANSWER
+from epypes.bundle.compare import Difference, add_tolerances
+from epypes.bundle.load import MODULE, SAMPLES, SETTINGS
+from epypes.bundle.manifest import write_manifest
+from epypes.bundle.replay import (
+    REPLAY_TIMEOUT_S,
+    ReplayReport,
+    library_settings,
+    named_here,
+    replay_isolated,
+    usual_environment,
+)
+from epypes.bundle.requirements import REQUIREMENTS
+from epypes.bundle.settings import read_settings
+from epypes.errors import BundleError, PromotionRefused
+from epypes.optional import optional_import
+from epypes.wire.samples import load_sample, save_sample
+
+# As many as a replay of the usual and one of the other conditions.
+_PROCESSES: Final = 2
 _VARIABLE: Final = re.compile(r"[A-Z][A-Z0-9_]*")
-_SYSTEM: Final = (
-    *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
-    *("/System", "/Library", "/var/cache", "/var/lib"),
-)
-_EVENTS: Final = frozenset({"open", "os.listdir", "os.scandir", "sqlite3.connect"})
-_WAY_OUT: Final = (
-    "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
-    "it into the data of a package that is installed and read it with importlib.resources."
-)
-
-
-# -- conditions ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +128,6 @@ def other_conditions(module: Path) -> tuple[Condition, ...]:
     )
 
 
-def usual_environment() -> dict[str, str]:
-    """Return the environment of a replay under usual conditions: this one, without what changes Python itself."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return {**kept, "PYTHONHASHSEED": "0"}
-
-
 @cache
 def _another_locale() -> str:
     """Return an installed locale that writes numbers and dates otherwise than this one, as far as there is one."""
@@ -139,136 +141,139 @@ def _another_locale() -> str:
     return next(others, "C.UTF-8" if now in ("C", "POSIX") else "C")
 
 
-def library_settings() -> dict[str, str]:
-    """Return how libraries are set in this process, where that changes what functions compute."""
-    found: dict[str, str] = {}
-    numpy, cv2, decimal = (sys.modules.get(name) for name in ("numpy", "cv2", "decimal"))
-    if numpy is not None:
-        raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
-        found["numpy.seterr"] = f"{raising or 'no errors are raised'}"
-    if cv2 is not None:
-        found["cv2.setUseOptimized"] = f"{cv2.useOptimized()}"
-    if decimal is not None:
-        context = decimal.getcontext()
-        found["decimal.getcontext"] = f"prec={context.prec}, rounding={context.rounding}"
-    return found
+def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> ReplayReport:
+    """Replay a draft in fresh isolated processes, and write its tolerances, its requirements and its manifest.
 
-
-# -- files -----------------------------------------------------------------------------------------------------------
-
-
-class FileAccess:
-    """Notes, while its block runs, which files outside of a bundle its functions open.
+    An answer of f_out that is another one at each call, such as one with times, is not compared from then on.
 
     Parameters
     ----------
-    folder
-        The bundle.
+    draft
+        A folder with everything but requirements and manifest.
+    target
+        What it is to be; errors name it.
+    timeout_s
+        When a process is ended.
+
+    Raises
+    ------
+    PromotionRefused
+        The draft fails, or computes something else. The token and what changes it are named.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._is_on = False
-        self._opened: dict[str, str] = {}
-        self._made: set[str] = set()
-        # By path: what names it, and when it was written last.
-        self._named: dict[str, tuple[str, int]] = {}
-
-    def __enter__(self) -> Self:
-        self._is_on = True
-        sys.addaudithook(self._on_event)  # which can't be taken away again
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._is_on = False
-
-    def note_names(self, hyperparameters: Mapping[str, Any]) -> None:
-        """Note the files that the text of the module and values of hyperparameters name by an absolute path."""
-        named = [*_texts_of(self._folder)]
-        for token, value in hyperparameters.items():
-            named += [(text, f"Hyperparameter {token!r} (pipeline.toml)") for text in _texts_in(value)]
-        for text, what in named:
-            # A folder such as /tmp or /data is on every machine, or is part of a longer name.
-            if os.path.isabs(text) and Path(text).parts[2:] and os.path.exists(text):
-                self._named.setdefault(text, (what, os.stat(text).st_mtime_ns))
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Why the bundle is not alone: a sentence for each file that is not its own."""
-        found = {path: f"{what} opens {path}." for path, what in self._opened.items() if path not in self._made}
-        for text, (what, written_ns) in self._named.items():
-            # A file that has changed meanwhile was written, not read.
-            if os.path.exists(text) and os.stat(text).st_mtime_ns == written_ns:
-                found.setdefault(os.path.realpath(text), f"{what} names {text}, which is there.")
-        own = self._own_folders()
-        return tuple(
-            f"{reason} {_WAY_OUT}"
-            for path, reason in found.items()
-            if os.path.exists(path) and not own & {path, *map(str, Path(path).parents)}
-        )
-
-    def _own_folders(self) -> set[str]:
-        """Return the folders whose files are there wherever the bundle's requirements are."""
-        home = Path("~").expanduser()
-        packages = (module for name, module in [*sys.modules.items()] if "." not in name)
-        folders = [
-            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, sys.exec_prefix, *sysconfig.get_paths().values()),
-            *(folder for module in packages for folder in getattr(module, "__path__", ())),
-            *(os.environ.get("XDG_CACHE_HOME", home / ".cache"), os.environ.get("XDG_CONFIG_HOME", home / ".config")),
-            *_SYSTEM,
+    conditions = other_conditions(draft / MODULE)
+    with tempfile.TemporaryDirectory(prefix="epypes-proof-") as scratch, ThreadPoolExecutor(_PROCESSES) as pool:
+        replays = partial(pool.map, partial(_replayed, draft, target, Path(scratch), timeout_s))
+        usual, other = replays([(), conditions])
+        found = [*other.differences, *usual.differences]
+        found += [
+            Difference(f"What function {name!r} refers to is another one in another process.", token=_function(name))
+            for name, fingerprint in other.fingerprints.items()
+            if usual.fingerprints.get(name, fingerprint) != fingerprint
         ]
-        return {os.path.realpath(folder) for folder in folders} - {os.sep, os.path.realpath(home)}
-
-    def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
-        if not self._is_on or event not in _EVENTS or not isinstance(given[0], str | bytes | os.PathLike):
-            return
-        if what := self._running_function():
-            path = os.path.realpath(os.fsdecode(given[0]))
-            flags = given[2] if event == "open" and isinstance(given[2], int) else 0
-            if flags & os.O_CREAT or not os.path.exists(path):
-                self._made.add(path)
-            else:
-                self._opened.setdefault(path, what)
-
-    def _running_function(self) -> str:
-        """Return which function of the bundle is running; "" if none is, or it is importing a module."""
-        frame: FrameType | None = sys._getframe(2)
-        while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
-            file, name = Path(frame.f_code.co_filename), frame.f_code.co_name
-            if file.parent == self._folder:
-                return f"{'The module' if name == '<module>' else f'{name}()'} ({file.name}, line {frame.f_lineno})"
-            frame = frame.f_back
-        return ""
+        # What is the same in each run of a process, and not what the notebook computed, is not what threads make.
+        refused = {entry.token for entry in usual.differences if not entry.function}
+        refused |= {
+            entry.token for entry in found if not entry.is_noise and (entry.token, entry.function) != (ANSWER, "f_out")
+        }
+        reasons = _changed_settings(usual)
+        if refused or usual.outside or not usual.tokens:
+            own = _own_reasons(draft, usual, refused)
+            reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
+        if reasons:
+            raise PromotionRefused(target, reasons)
+    if found:
+        _tolerate(draft, [entry for entry in found if entry.token != ANSWER])
+    (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
+    write_manifest(draft, usual.environment)
+    return usual
 
 
-def named_here(folder: Path) -> list[str]:
-    """Return a sentence for each text of a bundle that names a file in the current folder, which a replay has not."""
+def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, changed: Sequence[Condition]) -> ReplayReport:
+    """Replay under usual conditions but for those that are changed; a failure is a difference of no token."""
+    variables: dict[str, str | None] = {**usual_environment()}
+    for condition in changed:
+        variables |= condition.environment
+    environment = {name: value for name, value in variables.items() if value is not None}
+    cwd = scratch / ("there" if any(condition.is_folder for condition in changed) else "here")
+    cwd.mkdir(exist_ok=True)
+    try:
+        return replay_isolated(draft, timeout_s=timeout_s, environment=environment, cwd=cwd)
+    except BundleError as error:
+        return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
+
+
+def _changed_settings(usual: ReplayReport) -> list[str]:
+    """Return how this process has set libraries that are set otherwise in a fresh one, as reasons."""
+    here = library_settings()
     return [
-        f"{what} names {text!r}, a file in the current folder here. The current folder is another one there. {_WAY_OUT}"
-        for text, what in _texts_of(folder)
-        if text.strip("./ ") and not os.path.isabs(text)
-        if os.path.isfile(text) or (os.sep in text and os.path.isdir(text))
+        f"The notebook has changed {name} ({here[name]}); a service has it as it is by default ({default}). "
+        "Change it inside the function that needs it, or set it back."
+        for name, default in usual.library_settings.items()
+        if here.get(name, default) != default
     ]
 
 
-def _texts_of(folder: Path) -> Iterator[tuple[str, str]]:
-    """Give the strings in a bundle's module with the function that has each; not those that nothing reads."""
-    module = folder / "pipeline.py"
-    tree = ast.parse(module.read_bytes())
-    functions: dict[ast.AST, str] = {}
-    unread: set[ast.AST] = set()
-    for node in ast.walk(tree):  # a function before the functions in it
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            functions |= dict.fromkeys(ast.walk(node), f"{node.name}()")
-        elif isinstance(node, ast.Expr):  # a docstring is one
-            unread.add(node.value)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in unread:
-            yield node.value, f"{functions.get(node, 'The module')} ({module.name}, line {node.lineno})"
+def _own_reasons(draft: Path, usual: ReplayReport, refused: Collection[str]) -> list[str]:
+    """Return why a draft is refused whatever the conditions are: it fails, or reads files outside of it."""
+    differs = any(entry.token in refused for entry in usual.differences)
+    files = [*usual.outside, *(named_here(draft) if differs else [])]
+    is_failed = any(not entry.token for entry in usual.differences)
+    return [*map(str, usual.differences), *files] if files or is_failed else []
 
 
-def _texts_in(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict | tuple | list):
-        for part in value.values() if isinstance(value, dict) else value:
-            yield from _texts_in(part)
+def _reasons(
+    found: Iterable[Difference],
+    refused: Collection[str],
+    usual: ReplayReport,
+    conditions: Sequence[Condition],
+    replays: Callable[[Sequence[Sequence[Condition]]], Iterable[ReplayReport]],
+) -> list[str]:
+    """Return what differs of the tokens that are refused, and what changes it, found by one change at a time."""
+    named = {(entry.sample, entry.token): entry for entry in found if entry.token in refused}
+    causes = {entry.token: [CALL] for entry in named.values() if entry.function}
+    unexplained = refused - causes.keys()
+    if unexplained:
+        known = _findings(usual)
+        reports = replays([(), *((condition,) for condition in conditions)])
+        for condition, report in zip((PROCESS, *conditions), reports, strict=True):
+            findings = _findings(report)
+            for token in {""} if "" in findings else unexplained:
+                # What another process alone changes differs under each condition too.
+                if findings.get(token) != known.get(token) and PROCESS not in causes.setdefault(token, []):
+                    causes[token].append(condition)
+    return [_explained(entry, causes.get(entry.token) or [UNKNOWN]) for entry in named.values()]
+
+
+def _findings(report: ReplayReport) -> dict[str, list[str]]:
+    """Return what a replay found of each token that differs, "" for a failure; and the fingerprints of functions."""
+    found = {_function(name): [fingerprint] for name, fingerprint in report.fingerprints.items()}
+    for entry in report.differences:
+        found.setdefault(entry.token, []).append(str(entry))
+    return found
+
+
+def _function(name: str) -> str:
+    """Return what stands for a function where otherwise a token does."""
+    return f"function {name}"
+
+
+def _explained(entry: Difference, causes: Sequence[Condition]) -> str:
+    """Return what differs, followed by what it depends on and the way out."""
+    names = " and ".join(cause.name.format(function=entry.function) for cause in causes)
+    ways = " ".join(cause.way_out for cause in causes)
+    return f"{str(entry).rstrip('.')}. It depends on {names}, something that is not a token. {ways}"
+
+
+def _tolerate(draft: Path, noise: Sequence[Difference]) -> None:
+    """Write tolerances, and leave the answers of f_out out of the samples: they may be bytes, which have none."""
+    with optional_import():
+        import tomlkit
+
+    document = tomlkit.parse((draft / SETTINGS).read_text(encoding="utf-8"))
+    add_tolerances(document, noise)
+    (draft / SETTINGS).write_text(tomlkit.dumps(document), encoding="utf-8")
+    rgb = read_settings(draft / SETTINGS).rgb
+    for path in (draft / SAMPLES).glob("*.npz"):
+        inputs, outputs = load_sample(path)
+        if outputs.pop(ANSWER, None) is not None:
+            save_sample(path, inputs, outputs, rgb=rgb)

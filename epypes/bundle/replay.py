@@ -6,6 +6,7 @@ records the samples anew instead.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import inspect
 import json
@@ -25,7 +26,6 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import ANSWER, answer_of
 from epypes.bundle.compare import Difference, difference, differences, largest_of
-from epypes.bundle.determinism import FileAccess, library_settings, usual_environment
 from epypes.bundle.fingerprint import Digester
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.manifest import check_manifest, environment, environment_differences, recorded_environment
@@ -54,6 +54,15 @@ _UNSTEADY: Final = (
 _UNKNOWN: Final = (
     "Neither the bundle nor what it runs on has changed as far as is known: a function may depend on something that is "
     "not a token, such as a file, the current folder, or what was installed beside its package."
+)
+_SYSTEM: Final = (
+    *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
+    *("/System", "/Library", "/var/cache", "/var/lib"),
+)
+_EVENTS: Final = frozenset({"open", "os.listdir", "os.scandir", "sqlite3.connect"})
+_WAY_OUT: Final = (
+    "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
+    "it into the data of a package that is installed and read it with importlib.resources."
 )
 
 
@@ -281,6 +290,12 @@ def replay_isolated(
     return ReplayReport(differences=found, **outcome)
 
 
+def usual_environment() -> dict[str, str]:
+    """Return the environment of a replay under usual conditions: this one, without what changes Python itself."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    return {**kept, "PYTHONHASHSEED": "0"}
+
+
 def main(arguments: Sequence[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
@@ -303,12 +318,11 @@ def _watched(folder: Path) -> ReplayReport:
             sample = load_sample(path)
             list(differences(sample, sample))
     before = frozenset(sys.modules)
-    ran = trace_lines(folder / MODULE)
-    with FileAccess(folder) as access:
-        bundle = read_bundle(folder, compare=False)
-        access.note_names(bundle.settings.hyperparameters)
-        fingerprints = _fingerprints(bundle)
-        report = replay(bundle, twice=True)
+    access, ran = FileAccess(folder), trace_lines(folder / MODULE)
+    bundle = read_bundle(folder, compare=False)
+    access.note_names(bundle.settings.hyperparameters)
+    fingerprints = _fingerprints(bundle)
+    report = replay(bundle, twice=True)
     sys.settrace(None)
     named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
     return replace(
@@ -374,6 +388,135 @@ def _unproved_lines(ran: Mapping[CodeType, Collection[int]]) -> list[str]:
     more = " and others" if len(spans) > _MOST_NAMED else ""
     text = f"No sample runs these lines of {MODULE}, so no replay proves them: {named}{more}."
     return [f"{text} Give payloads that do: samples=[...]."]
+
+
+# -- what is watched -------------------------------------------------------------------------------------------------
+
+
+def library_settings() -> dict[str, str]:
+    """Return how libraries are set in this process, where that changes what functions compute."""
+    found: dict[str, str] = {}
+    numpy, cv2, decimal = (sys.modules.get(name) for name in ("numpy", "cv2", "decimal"))
+    if numpy is not None:
+        raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
+        found["numpy.seterr"] = f"{raising or 'no errors are raised'}"
+    if cv2 is not None:
+        found["cv2.setUseOptimized"] = f"{cv2.useOptimized()}"
+    if decimal is not None:
+        context = decimal.getcontext()
+        found["decimal.getcontext"] = f"prec={context.prec}, rounding={context.rounding}"
+    return found
+
+
+class FileAccess:
+    """Notes from now on which files outside of a bundle its functions open.
+
+    An audit hook receives every file that Python opens. Libraries in C open files without it, so their names are looked
+    for in the text of the module and in the values of hyperparameters.
+
+    Parameters
+    ----------
+    folder
+        The bundle.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._opened: dict[str, str] = {}
+        self._made: set[str] = set()
+        # By path: what names it, and when it was written last.
+        self._named: dict[str, tuple[str, int]] = {}
+        sys.addaudithook(self._on_event)
+
+    def note_names(self, hyperparameters: Mapping[str, Any]) -> None:
+        """Note the files that the text of the module and values of hyperparameters name by an absolute path."""
+        named = [*_texts_of(self._folder)]
+        for token, value in hyperparameters.items():
+            named += [(text, f"Hyperparameter {token!r} (pipeline.toml)") for text in _texts_in(value)]
+        for text, what in named:
+            # A folder such as /tmp or /data is on every machine, or is part of a longer name.
+            if os.path.isabs(text) and Path(text).parts[2:] and os.path.exists(text):
+                self._named.setdefault(text, (what, os.stat(text).st_mtime_ns))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Why the bundle is not alone: a sentence for each file that is not its own."""
+        found = {path: f"{what} opens {path}." for path, what in self._opened.items() if path not in self._made}
+        for text, (what, written_ns) in self._named.items():
+            # A file that has changed meanwhile was written, not read.
+            if os.path.exists(text) and os.stat(text).st_mtime_ns == written_ns:
+                found.setdefault(os.path.realpath(text), f"{what} names {text}, which is there.")
+        own = self._own_folders()
+        return tuple(
+            f"{reason} {_WAY_OUT}"
+            for path, reason in found.items()
+            if os.path.exists(path) and not own & {path, *map(str, Path(path).parents)}
+        )
+
+    def _own_folders(self) -> set[str]:
+        """Return the folders whose files are there wherever the bundle's requirements are."""
+        home = Path("~").expanduser()
+        packages = (module for name, module in [*sys.modules.items()] if "." not in name)
+        folders = [
+            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, *_SYSTEM),
+            *(folder for module in packages for folder in getattr(module, "__path__", ())),
+            *(os.environ.get("XDG_CACHE_HOME", home / ".cache"), os.environ.get("XDG_CONFIG_HOME", home / ".config")),
+        ]
+        return {os.path.realpath(folder) for folder in folders} - {os.sep, os.path.realpath(home)}
+
+    def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
+        if event not in _EVENTS or not isinstance(given[0], str | bytes | os.PathLike):
+            return
+        if what := self._running_function():
+            path = os.path.realpath(os.fsdecode(given[0]))
+            flags = given[2] if event == "open" and isinstance(given[2], int) else 0
+            if flags & os.O_CREAT or not os.path.exists(path):
+                self._made.add(path)
+            else:
+                self._opened.setdefault(path, what)
+
+    def _running_function(self) -> str:
+        """Return which function of the bundle is running; "" if none is, or it is importing a module."""
+        frame: FrameType | None = sys._getframe(2)
+        while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+            file, name = Path(frame.f_code.co_filename), frame.f_code.co_name
+            if file.parent == self._folder:
+                return f"{'The module' if name == '<module>' else f'{name}()'} ({file.name}, line {frame.f_lineno})"
+            frame = frame.f_back
+        return ""
+
+
+def named_here(folder: Path) -> list[str]:
+    """Return a sentence for each text of a bundle that names a file in the current folder, which a replay has not."""
+    return [
+        f"{what} names {text!r}, a file in the current folder here. The current folder is another one there. {_WAY_OUT}"
+        for text, what in _texts_of(folder)
+        if text.strip("./ ") and not os.path.isabs(text)
+        if os.path.isfile(text) or (os.sep in text and os.path.isdir(text))
+    ]
+
+
+def _texts_of(folder: Path) -> Iterator[tuple[str, str]]:
+    """Give the strings in a bundle's module with the function that has each; not those that nothing reads."""
+    module = folder / "pipeline.py"
+    tree = ast.parse(module.read_bytes())
+    functions: dict[ast.AST, str] = {}
+    unread: set[ast.AST] = set()
+    for node in ast.walk(tree):  # a function before the functions in it
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            functions |= dict.fromkeys(ast.walk(node), f"{node.name}()")
+        elif isinstance(node, ast.Expr):  # a docstring is one
+            unread.add(node.value)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in unread:
+            yield node.value, f"{functions.get(node, 'The module')} ({module.name}, line {node.lineno})"
+
+
+def _texts_in(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | tuple | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts_in(part)
 
 
 # -- verification --------------------------------------------------------------------------------------------------
