@@ -6,9 +6,10 @@ does. A bundle tolerates noise that its proof has seen, SAFETY times as large. N
 
 from __future__ import annotations
 
+import decimal
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -19,16 +20,18 @@ from epypes.wording import counted
 
 # As Python and OpenCV write them; other text may hold numbers that look alike.
 _ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
-# Whose repr says all of it.
+# Whose repr says all of it: it tells -0.0 from 0.0, and makes NaN agree with itself.
 _EXACT: Final = (bool, int, float, complex, str, bytes, bytearray, type(None))
 # What is left where large numbers of an array cancel each other is a few of the last digits of those.
 FLOOR: Final = 16.0
 # The next run may be further off than the worst of a few; ten times that is far below any change of an algorithm.
 SAFETY: Final = 10.0
 _MEANING: Final = (
-    "Replays of the samples gave other last digits: a replay may differ by {:g} times as",
+    f"Replays of the samples gave other last digits: a replay may differ by {SAFETY:g} times as",
     "much, and each number by no more than the relative part of its own magnitude.",
 )
+# One digit is enough: people read the file, and small changes of the noise don't change it.
+_ONE_DIGIT_UP: Final = decimal.Context(prec=1, rounding=decimal.ROUND_UP)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +111,22 @@ def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, whe
         yield _named(where, f"type {type(expected).__name__}", type(got).__name__)
     elif hasattr(expected, "dtype") and hasattr(expected, "shape") and not is_table(expected):
         yield from _in_arrays(expected, got, tolerance, where)
+    elif isinstance(expected, set | frozenset):
+        left, right = ({*map(set_sort_key, items)} for items in (expected, got))
+        if left != right:
+            yield _named(where, f"{sorted(left - right)!r:.60} in the set", f"{sorted(right - left)!r:.60}")
+    elif (parts := _parts(expected)) is not None:
+        others = _parts(got) or []
+        left_at, right_at = ([place for place, _ in side] for side in (parts, others))
+        if left_at == right_at:
+            for (place, left), (_, right) in zip(parts, others, strict=True):
+                yield from differences(left, right, tolerance, f"{where}{place} ")
+        elif isinstance(expected, list | tuple):
+            yield _named(where, f"{len(parts)} items", f"{len(others)}")
+        else:
+            yield _named(where, f"the keys {', '.join(left_at):.80}", f"{', '.join(right_at):.80}")
     else:
-        inside = next((inside for is_kind, inside in _INSIDE if is_kind(expected)), _in_others)
-        yield from inside(expected, got, tolerance, where)
+        yield from _in_objects(expected, got, tolerance, where)
 
 
 def difference(sample: str, token: str, found: Iterable[Difference]) -> Difference | None:
@@ -138,74 +154,16 @@ def _named(where: str, expected: str, got: str) -> Difference:
     return Difference(f"{where}expected {expected}, got {got}", where.replace(" ", ""))
 
 
-def _in_mappings(
-    expected: Mapping[Any, Any], got: Mapping[Any, Any], tolerance: Tolerance | None, where: str
-) -> Iterator[Difference]:
-    if _keys(expected) != _keys(got):
-        yield _named(where, f"the keys {list(expected)!r:.80}", f"{list(got)!r:.80}")
-        return
-    for key in expected:
-        yield from differences(expected[key], got[key], tolerance, f"{where}[{key!r}] ")
-
-
-def _keys(mapping: Mapping[Any, Any]) -> list[tuple[type, str]]:
-    # 1, 1.0 and True are equal, but not the same.
-    return [(type(key), _described(key)) for key in mapping]
-
-
-def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
-    if len(expected) != len(got):
-        yield _named(where, f"{len(expected)} items", f"{len(got)}")
-        return
-    for index, (left, right) in enumerate(zip(expected, got, strict=True)):
-        yield from differences(left, right, tolerance, f"{where}[{index}] ")
-
-
-def _in_sets(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
-    left, right = ({*map(set_sort_key, items)} for items in (expected, got))
-    if left != right:
-        yield _named(where, f"{sorted(left - right)!r:.60} in the set", f"{sorted(right - left)!r:.60}")
-
-
-def _in_records(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
-    names = FIELDS[record_type(expected)]
-    for name, left, right in zip(names, record_fields(expected), record_fields(got), strict=True):
-        yield from differences(left, right, tolerance, f"{where}.{name} ")
-
-
-def _in_tables(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
-    left, right = table_parts(expected), table_parts(got)
-    ours_at, theirs_at = ([place for place, _ in parts] for parts in (left, right))
-    if ours_at != theirs_at:
-        yield _named(where, f"the parts {ours_at!r:.80}", f"{theirs_at!r:.80}")
-        return
-    for (place, ours), (_, theirs) in zip(left, right, strict=True):
-        yield from differences(ours, theirs, tolerance, f"{where}{place} ")
-
-
-def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
-    # repr tells -0.0 from 0.0 and makes NaN agree with itself.
-    if repr(expected) == repr(got):
-        return
-    largest, magnitude = abs(got - expected), abs(expected)
-    is_finite = math.isfinite(largest)
-    if is_finite and tolerance and largest <= min(tolerance.absolute, tolerance.relative * magnitude):
-        return
-    relative = largest / magnitude if is_finite and magnitude else math.inf
-    yield replace(
-        _named(where, repr(expected), repr(got)),
-        largest=_finite(largest),
-        relative=relative,
-        is_noise=relative <= _noise(2.0**-52),
-    )
-
-
-def _in_others(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
-    left, right = _described(expected), _described(got)
-    if left != right:
-        is_integer = type(expected) is int and abs(expected) < 2**1000 > abs(got)
-        largest = float(abs(got - expected)) if is_integer else None
-        yield replace(_named(where, f"{left:.60}", f"{right:.60}"), largest=largest)
+def _parts(value: Any) -> list[tuple[str, Any]] | None:
+    """Return what a container, an OpenCV record or a table consists of, each with its place; None for another value."""
+    if isinstance(value, Mapping):
+        # 1, 1.0 and True are equal, but not the same: by their text they differ.
+        return [(f"[{_described(key)}]", part) for key, part in value.items()]
+    if isinstance(value, list | tuple):
+        return [(f"[{index}]", part) for index, part in enumerate(value)]
+    if name := record_type(value):
+        return [(f".{field}", part) for field, part in zip(FIELDS[name], record_fields(value), strict=True)]
+    return table_parts(value) if is_table(value) else None
 
 
 def _described(value: Any) -> str:
@@ -213,15 +171,20 @@ def _described(value: Any) -> str:
     return repr(value) if type(value) in _EXACT else _ADDRESS.sub(r"\g<1>0x", repr(value))
 
 
-_Inside = Callable[[Any, Any, Tolerance | None, str], Iterator[Difference]]
-_INSIDE: Final[tuple[tuple[Callable[[Any], object], _Inside], ...]] = (
-    (lambda value: isinstance(value, Mapping), _in_mappings),
-    (lambda value: isinstance(value, list | tuple), _in_sequences),
-    (lambda value: isinstance(value, set | frozenset), _in_sets),
-    (lambda value: type(value) in (float, complex), _in_numbers),
-    (record_type, _in_records),
-    (is_table, _in_tables),
-)
+def _in_objects(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
+    left, right = _described(expected), _described(got)
+    if left == right:
+        return
+    found = _named(where, f"{left:.60}", f"{right:.60}")
+    if type(expected) in (int, float, complex):
+        import numpy as np
+
+        numbers = np.array([expected, got])
+        if not numbers.dtype.hasobject:  # as integers beyond 64 bits have
+            for measured in _in_arrays(numbers[:1], numbers[1:], tolerance, where):
+                yield replace(measured, text=found.text, index=found.index)
+            return
+    yield found
 
 
 def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:
@@ -230,41 +193,35 @@ def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str)
     if expected.dtype != got.dtype or expected.shape != got.shape:
         yield _named(where, f"{expected.dtype} {expected.shape}", f"{got.dtype} {got.shape}")
         return
-    if expected.dtype.hasobject:
-        yield from _in_sequences(np.asarray(expected).reshape(-1).tolist(), got.reshape(-1).tolist(), tolerance, where)
+    left, right = (np.ascontiguousarray(side).reshape(-1) for side in (expected, got))
+    if left.dtype.hasobject:
+        yield from differences(left.tolist(), right.tolist(), tolerance, where)
         return
-    left, right = np.ascontiguousarray(expected).reshape(-1), np.ascontiguousarray(got).reshape(-1)
     if left.tobytes() == right.tobytes():
         return
-    size = left.dtype.itemsize
-    unlike = (left.view(np.uint8).reshape(-1, size) != right.view(np.uint8).reshape(-1, size)).any(axis=1)
-    distance, magnitude, epsilon = _distances(left, right)
+    unlike = (left.view(np.uint8).reshape(left.size, -1) != right.view(np.uint8).reshape(left.size, -1)).any(axis=1)
+    distance, relative, epsilon = _distances(left, right)
     if tolerance and epsilon:
-        unlike &= ~(distance <= np.minimum(tolerance.absolute, tolerance.relative * magnitude))
-    if unlike.any():
-        yield _in_elements(left, right, unlike, expected.shape, where, (distance, magnitude, epsilon))
-
-
-def _in_elements(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Difference:
-    import numpy as np
-
-    distance, magnitude, epsilon = measured
+        unlike &= (distance > tolerance.absolute) | (relative > tolerance.relative)
+    if not unlike.any():
+        return
     first, count = int(unlike.argmax()), int(unlike.sum())
-    index = list(map(int, np.unravel_index(first, shape))) if shape else []
+    index = list(map(int, np.unravel_index(first, expected.shape))) if expected.shape else []
     text = f"{where}{count} of {left.size} values differ, first at {index}: expected {left[first]}, got {right[first]}"
-    largest = None if distance is None else _finite(float(distance[unlike].max()))
+    largest = None if distance is None else float(distance[unlike].max())
+    largest = None if largest is None or not math.isfinite(largest) else largest
     if largest is not None and count > 1:
         text += f"; the largest difference is {largest:.6g}"
-    relative = 0.0
-    if epsilon:
-        with np.errstate(all="ignore"):
-            relative = float((distance[unlike] / magnitude[unlike]).max())
-    is_noise = epsilon > 0 and relative <= _noise(epsilon)
-    return Difference(text, where.replace(" ", "") + str(index), count, largest, relative, is_noise)
+    part = float(relative[unlike].max()) if epsilon else 0.0
+    is_noise = epsilon > 0 and part <= math.sqrt(epsilon)
+    yield Difference(text, where.replace(" ", "") + str(index), count, largest, part, is_noise)
 
 
 def _distances(left: Any, right: Any) -> tuple[Any, Any, float]:
-    """Return how far numbers differ, the magnitudes of the left ones, and their epsilon; see Tolerance."""
+    """Return how far numbers differ, also as parts of the left ones (see Tolerance), and their epsilon.
+
+    Epsilon is 0.0 for what no tolerance covers: integers, and what is infinite or NaN on one side alone.
+    """
     import numpy as np
 
     kind = left.dtype.kind
@@ -281,16 +238,8 @@ def _distances(left: Any, right: Any) -> tuple[Any, Any, float]:
         magnitude[~np.isfinite(magnitude)] = 0.0
         epsilon = float(np.finfo(left.dtype).eps)
         magnitude = np.maximum(magnitude, FLOOR * math.sqrt(epsilon) * magnitude.max(initial=0.0))
-    return distance, magnitude, epsilon if np.isfinite(distance).all() else 0.0
-
-
-def _noise(epsilon: float) -> float:
-    """Return the relative difference up to which less than half of the digits are others."""
-    return math.sqrt(epsilon)
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None
+        relative = np.where(distance == 0.0, 0.0, distance / magnitude)
+    return distance, relative, epsilon if np.isfinite(distance).all() else 0.0
 
 
 def add_tolerances(document: Any, differing: Iterable[Difference]) -> None:
@@ -312,19 +261,11 @@ def add_tolerances(document: Any, differing: Iterable[Difference]) -> None:
         entries = document.setdefault("tolerance", tomlkit.table(is_super_table=True))
         known, entry = entries.get(noise.token, {}), tomlkit.table()
         for line in _MEANING:
-            entry.add(tomlkit.comment(line.format(SAFETY)))
+            entry.add(tomlkit.comment(line))
         for name, bound in (("absolute", noise.largest or 0.0), ("relative", noise.relative)):
-            # One digit is enough, rounded up: people read the file, and small changes of the noise don't change it.
-            entry.add(name, max(_rounded_up(SAFETY * bound), known.get(name, 0.0)))
+            rounded = float(_ONE_DIGIT_UP.create_decimal_from_float(SAFETY * bound))
+            entry.add(name, max(rounded, known.get(name, 0.0)))
         entries[noise.token] = entry
-
-
-def _rounded_up(number: float) -> float:
-    """Return a number rounded up to one digit."""
-    if number == 0.0:
-        return 0.0
-    step = 10.0 ** (math.floor(math.log10(number)))
-    return float(f"{math.ceil(number / step) * step:.0e}")
 
 
 def read_tolerances(document: Mapping[str, Any]) -> dict[str, Tolerance]:

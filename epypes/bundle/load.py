@@ -113,7 +113,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         own |= {name: called_for(name, port) for name, port in state.guarded(ports).items()}
     except (AttributeError, KeyError, TypeError) as error:
         missing = repr(error.name) if isinstance(error, AttributeError) else error
-        text = f"{folder / MODULE} has no {missing} that {SETTINGS} names. Promote the graph again."
+        text = f"{folder / MODULE} defines no {missing}, which the bundle needs. Promote the graph again."
         raise BundleError(folder, text) from error
     return Bundle(folder, cg, replace(settings, hyperparameters=values), digest, own, enums)
 

@@ -1,16 +1,15 @@
-"""Promotion of a notebook file: it is executed in a new kernel, and its graph is promoted there."""
+"""Promotion of a notebook file: it is executed in a new kernel, and its graph is promoted there.
+
+The kernel sends the progress, and the reasons against a promotion, as displayed data of a type of its own.
+"""
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from epypes.bundle.promote import promote
 from epypes.errors import BundleError, EpypesError, PromotionRefused, UnknownName
@@ -18,8 +17,7 @@ from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
-Progress = Callable[[int, int], None]
-OnText = Callable[[str], None]
+_MEDIA_TYPE: Final = "application/vnd.epypes.promotion+json"
 
 
 def promote_notebook(
@@ -27,8 +25,8 @@ def promote_notebook(
     name: str,
     to: str | Path,
     outputs: Sequence[str] | None = None,
-    on_cell: Progress = lambda done, total: None,
-    on_progress: OnText = lambda text: None,
+    on_cell: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: Callable[[str], None] = lambda text: None,
     samples: Sequence[str] = (),
 ) -> None:
     """Execute every cell of a notebook in a new kernel of this Python, then promote one of its objects there.
@@ -44,7 +42,7 @@ def promote_notebook(
     on_cell
         Called with the number of code cells done and their total.
     on_progress
-        Called on a thread of its own with what the promotion in the kernel is doing.
+        Called with what the promotion in the kernel is doing.
     samples
         The variables that hold further payloads, as ``promote`` takes them, or lists of such.
 
@@ -55,49 +53,37 @@ def promote_notebook(
     PromotionRefused
         The graph can't be promoted, or there is no such variable.
     """
-    path = Path(notebook)
-    with tempfile.TemporaryDirectory(prefix="epypes-promote-") as scratch:
-        outcome = Path(scratch) / "outcome.json"
-        code = (
-            "from epypes.bundle.notebook import promote_here as _promote_here\n"
-            f"_promote_here({name!r}, {str(Path(to).resolve())!r}, "
-            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r}, {str(Path(scratch) / 'progress')!r}, "
-            f"{list(samples)!r})"
-        )
-        with _lines_of(Path(scratch) / "progress", on_progress):
-            _execute(path, code, on_cell, Path(scratch))
-        ended = json.loads(outcome.read_text(encoding="utf-8"))
-    if ended["reasons"]:
-        raise PromotionRefused(to, ended["reasons"])
+    given = name, str(Path(to).resolve()), None if outputs is None else list(outputs), list(samples)
+    last_cell = f"from epypes.bundle.notebook import promote_here as _promote_here\n_promote_here{given!r}"
+    reasons: list[str] = []
+
+    def on_message(message: Mapping[str, Any]) -> None:
+        if "progress" in message:
+            on_progress(message["progress"])
+        reasons.extend(message.get("reasons", ()))
+
+    _execute(Path(notebook), last_cell, on_cell, on_message)
+    if reasons:
+        raise PromotionRefused(to, reasons)
 
 
-@contextmanager
-def _lines_of(pipe: Path, on_line: OnText) -> Iterator[None]:
-    """While the block runs, pass on every line that is written into a named pipe."""
-    os.mkfifo(pipe)
-    # Opened for both, it opens at once, and does not end when the kernel closes its side.
-    descriptor = os.open(pipe, os.O_RDWR)
-
-    def read() -> None:
-        with os.fdopen(descriptor, encoding="utf-8", closefd=False) as lines:
-            for line in iter(lines.readline, "\n"):
-                on_line(line.rstrip("\n"))
-
-    reader = threading.Thread(target=read, name="epypes-promotion-progress", daemon=True)
-    reader.start()
-    try:
-        yield
-    finally:
-        os.write(descriptor, b"\n")
-        reader.join()
-        os.close(descriptor)
-
-
-def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> None:
+def _execute(
+    path: Path,
+    last_cell: str,
+    on_cell: Callable[[int, int], None],
+    on_message: Callable[[Mapping[str, Any]], None],
+) -> None:
+    """Execute a notebook and one cell more, and pass on what is displayed with our media type."""
     with optional_import():
         import nbformat
         from nbclient import NotebookClient
         from nbclient.exceptions import CellExecutionError, DeadKernelError
+
+    class Client(NotebookClient):  # type: ignore[misc]
+        def process_message(self, msg: dict[str, Any], cell: Any, cell_index: int) -> Any:
+            if _MEDIA_TYPE in msg["content"].get("data", ()):
+                on_message(msg["content"]["data"][_MEDIA_TYPE])
+            return super().process_message(msg, cell, cell_index)
 
     try:
         document = nbformat.read(path, as_version=4)
@@ -115,47 +101,42 @@ def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> No
         done += 1
         on_cell(min(done, total), total)
 
-    client = NotebookClient(
-        document,
-        timeout=None,
-        kernel_name="python3",
-        resources={"metadata": {"path": str(path.resolve().parent)}},
-        on_cell_executed=cell_executed,
-    )
-    # Sockets in a folder of this user: over TCP others on the machine could listen.
-    client.config.KernelManager.transport = "ipc"
-    client.config.KernelManager.ip = str(scratch / "kernel")
-    try:
-        client.execute()
-    except CellExecutionError as error:
-        text = f"{path}: code cell {done} of {total} raised {error.ename}: {error.evalue}"
-        raise BundleError(path, text) from error
-    except DeadKernelError as error:
-        raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
+    with tempfile.TemporaryDirectory(prefix="epypes-promote-") as scratch:
+        client = Client(
+            document,
+            timeout=None,
+            kernel_name="python3",
+            resources={"metadata": {"path": str(path.resolve().parent)}},
+            on_cell_executed=cell_executed,
+        )
+        # Sockets in a folder of this user: over TCP others on the machine could listen.
+        client.config.KernelManager.transport = "ipc"
+        client.config.KernelManager.ip = str(Path(scratch) / "kernel")
+        try:
+            client.execute()
+        except CellExecutionError as error:
+            text = f"{path}: code cell {done} of {total} raised {error.ename}: {error.evalue}"
+            raise BundleError(path, text) from error
+        except DeadKernelError as error:
+            raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
 
 
-def promote_here(
-    name: str, to: str, outputs: Sequence[str] | None, outcome: str, pipe: str, samples: Sequence[str] = ()
-) -> None:
-    """Promote a variable of the notebook that this kernel runs; write the reasons against it, if any, as JSON."""
+def promote_here(name: str, to: str, outputs: Sequence[str] | None, samples: Sequence[str]) -> None:
+    """Promote a variable of the notebook that this kernel runs; display the progress and the reasons against it."""
+    from IPython.display import display
 
-    def on_progress(text: str) -> None:
-        with open(pipe, "w", encoding="utf-8") as file:
-            file.write(" ".join(text.split()) + "\n")
+    def send(**message: Any) -> None:
+        display({_MEDIA_TYPE: message}, raw=True)
 
     names = vars(sys.modules["__main__"])
     try:
         if name not in names:
             known = [key for key, value in names.items() if isinstance(value, CompGraphRunner | Pipeline)]
             raise UnknownName("variable", name, known, "that holds a runner or pipeline in the notebook")
-        promote(names[name], to, outputs, samples=_payloads(names, samples), on_progress=on_progress)
-    except PromotionRefused as refused:
-        reasons = list(refused.reasons)
+        payloads = _payloads(names, samples)
+        promote(names[name], to, outputs, samples=payloads, on_progress=lambda text: send(progress=text))
     except EpypesError as error:
-        reasons = [str(error)]
-    else:
-        reasons = []
-    Path(outcome).write_text(json.dumps({"reasons": reasons}), encoding="utf-8")
+        send(reasons=list(error.reasons) if isinstance(error, PromotionRefused) else [str(error)])
 
 
 def _payloads(names: Mapping[str, Any], variables: Sequence[str]) -> list[Any]:

@@ -16,12 +16,13 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.clone import clone_runner
+from epypes.bundle.determinism import prove
+from epypes.bundle.draft import draft_folder, swap_folders
 from epypes.bundle.expressions import write_arrays
 from epypes.bundle.graphs import parameters_of
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
-from epypes.bundle.proof import draft_folder, prove, swap_folders
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import (
     Settings,

@@ -6,32 +6,40 @@ records the samples anew instead.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import inspect
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from types import CodeType, FrameType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from epypes.bundle.adapters import ANSWER, answer_of
 from epypes.bundle.compare import Difference, difference, differences, largest_of
-from epypes.bundle.file_access import FileAccess
 from epypes.bundle.fingerprint import Digester
 from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.manifest import check_manifest, environment, environment_differences, recorded_environment
-from epypes.bundle.requirements import REQUIREMENTS, fresh_environment, imported_names, pins, requirement_lines
+from epypes.bundle.requirements import (
+    REQUIREMENTS,
+    fresh_environment,
+    imported_names,
+    pins,
+    read_pins,
+    requirement_lines,
+)
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner, Run
+from epypes.run import CompGraphRunner
 from epypes.run.guard import as_written
 from epypes.wire.samples import load_sample, save_sample
 from epypes.wording import counted
@@ -46,6 +54,15 @@ _UNSTEADY: Final = (
 _UNKNOWN: Final = (
     "Neither the bundle nor what it runs on has changed as far as is known: a function may depend on something that is "
     "not a token, such as a file, the current folder, or what was installed beside its package."
+)
+_SYSTEM: Final = (
+    *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
+    *("/System", "/Library", "/var/cache", "/var/lib"),
+)
+_EVENTS: Final = frozenset({"open", "os.listdir", "os.scandir", "sqlite3.connect"})
+_WAY_OUT: Final = (
+    "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
+    "it into the data of a package that is installed and read it with importlib.resources."
 )
 
 
@@ -79,12 +96,12 @@ class ReplayReport:
 
     samples: int
     tokens: int
-    differences: tuple[Difference, ...]
-    requirements: tuple[str, ...] = ()
+    differences: Sequence[Difference]
+    requirements: Sequence[str] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
-    causes: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    outside: tuple[str, ...] = ()
+    causes: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    outside: Sequence[str] = ()
     library_settings: Mapping[str, str] = field(default_factory=dict)
     fingerprints: Mapping[str, str] = field(default_factory=dict)
 
@@ -116,19 +133,20 @@ def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
         call is something else then. That time it is also checked that no function changes an object in its input.
     """
     pipeline_of(bundle, None, None)  # what serves it can be made
-    seen: dict[Path, list[dict[str, Difference | None]]] = {path: [] for path in bundle.samples}
-    for path in bundle.samples:
-        seen[path].append(_compared(bundle, path))
-    for path in reversed(bundle.samples) if twice else ():
-        seen[path].append(_compared(bundle, path, check_mutation=True))
-    found: list[Difference] = []
-    for path, passes in seen.items():
-        differing = {
-            token: [each[token] for each in passes] for token in passes[0] if any(each[token] for each in passes)
-        }
-        found += _explained(bundle, path, differing) if differing else ()
-    tokens = sum(len(passes[0]) for passes in seen.values())
-    return ReplayReport(len(bundle.samples), tokens, tuple(found), environment=environment())
+    # By sample and token: what each pass found.
+    table: dict[Path, dict[str, list[Difference | None]]] = {path: {} for path in bundle.samples}
+    for is_second in (False, True) if twice else (False,):
+        for path in reversed(bundle.samples) if is_second else bundle.samples:
+            for token, found in _compared(bundle, path, check_mutation=is_second).items():
+                table[path].setdefault(token, []).append(found)
+    explained = [
+        entry
+        for path, passes in table.items()
+        if any(any(found) for found in passes.values())
+        for entry in _explained(bundle, path, passes)
+    ]
+    tokens = sum(map(len, table.values()))
+    return ReplayReport(len(table), tokens, tuple(explained), environment=environment())
 
 
 def _compared(bundle: Bundle, path: Path, *, check_mutation: bool = False) -> dict[str, Difference | None]:
@@ -139,9 +157,9 @@ def _compared(bundle: Bundle, path: Path, *, check_mutation: bool = False) -> di
         tokens = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
         text = f"Sample {path.stem} has the tokens {tokens}, which are not those of pipeline.toml. Promote again."
         raise BundleError(path, text)
-    got = _values(bundle, _run(bundle, inputs, check_mutation=check_mutation), outputs)
+    values = _run(bundle, inputs, outputs, check_mutation=check_mutation)
     return {
-        token: difference(path.stem, token, differences(expected, got[token], settings.tolerances.get(token)))
+        token: difference(path.stem, token, differences(expected, values[token], settings.tolerances.get(token)))
         for token, expected in outputs.items()
     }
 
@@ -150,52 +168,56 @@ def record_again(bundle: Bundle) -> ReplayReport:
     """Run a bundle's samples in this process, and record their outputs."""
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
-        save_sample(path, inputs, _values(bundle, _run(bundle, inputs), outputs), rgb=bundle.settings.rgb)
+        values = _run(bundle, inputs, outputs)
+        save_sample(path, inputs, {name: values[name] for name in outputs}, rgb=bundle.settings.rgb)
     return ReplayReport(len(bundle.samples), 0, ())
 
 
-def _run(bundle: Bundle, inputs: Mapping[str, Any], *, check_mutation: bool = False) -> Run:
-    runner = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters, check_mutation=check_mutation)
-    return runner.run(**inputs)
+def _run(
+    bundle: Bundle, inputs: Mapping[str, Any], outputs: Collection[str], *, check_mutation: bool = False
+) -> dict[str, Any]:
+    """Return the values of a new run by token, and the answer that is made of it where that is among the outputs."""
+    settings = bundle.settings
+    run = CompGraphRunner(bundle.cg, settings.hyperparameters, check_mutation=check_mutation).run(**inputs)
+    if ANSWER not in outputs:
+        return dict(run)
+    return {**run, ANSWER: answer_of(bundle.own["f_out"], settings.name, run, settings.attributes)}
 
 
-def _values(bundle: Bundle, run: Run, names: Collection[str]) -> dict[str, Any]:
-    """Return values of a run by token, and the answer that is made of it where that is among the names."""
-    values = {name: run[name] for name in names if name != ANSWER}
-    if ANSWER in names:
-        settings = bundle.settings
-        values[ANSWER] = answer_of(bundle.own["f_out"], settings.name, run, settings.attributes)
-    return values
-
-
-def _explained(
-    bundle: Bundle, path: Path, differing: Mapping[str, Sequence[Difference | None]]
-) -> Iterator[Difference]:
+def _explained(bundle: Bundle, path: Path, passes: Mapping[str, Sequence[Difference | None]]) -> Iterator[Difference]:
     """Give the difference of each token of a sample, with the first function that computes something else each time.
 
-    The sample is run some times more. What goes further away each time is a clock or a counter, and no noise.
+    What goes further away with each run is a clock or a counter, and no noise.
     """
-    inputs, _ = load_sample(path)
-    noise = {token for token, entries in differing.items() if all(entry.is_noise for entry in entries if entry)}
-    distances: dict[str, list[float]] = {token: [0.0] for token in noise}
-    unsteady = {token for token, entries in differing.items() if len({entry and entry.text for entry in entries}) > 1}
+    distances = _distances(bundle, path)
+    unsteady = {token for token, found in distances.items() if any(found)}
+    unsteady |= {token for token, found in passes.items() if len({entry and entry.text for entry in found}) > 1}
+    for token, found in passes.items():
+        if any(found):
+            entry = largest_of([entry for entry in found if entry])
+            is_noise = entry.is_noise and not _is_growing(distances[token])
+            function = _origin(bundle.cg, token, unsteady) if token in unsteady else ""
+            yield replace(entry, is_noise=is_noise, function=function)
+
+
+def _distances(bundle: Bundle, path: Path) -> dict[str, list[float]]:
+    """Run a sample some times more; return by token how far each run is from the first, infinity if in no number."""
+    inputs, outputs = load_sample(path)
     first: dict[str, Any] = {}
+    distances: dict[str, list[float]] = {}
     for number in range(_MOST_RUNS):
-        run = _run(bundle, inputs)
-        values = _values(bundle, run, {*run, *differing})
+        values = _run(bundle, inputs, outputs)
         first = first or values
         for token, value in values.items():
             found = difference("", token, differences(first[token], value))
-            unsteady |= {token} if found else set()
-            if number and token in distances:
-                distances[token].append(found.largest or 0.0 if found else 0.0)
-        growing = {token for token, found in distances.items() if all(left < right for left, right in pairwise(found))}
-        if number > 1 and not growing:
+            distances.setdefault(token, []).append((found.largest or math.inf) if found else 0.0)
+        if number > 1 and not any(map(_is_growing, distances.values())):
             break
-    for token, entries in differing.items():
-        entry = largest_of([entry for entry in entries if entry])
-        function = _origin(bundle.cg, token, unsteady) if token in unsteady else ""
-        yield replace(entry, is_noise=entry.is_noise and token not in growing, function=function)
+    return distances
+
+
+def _is_growing(distances: Sequence[float]) -> bool:
+    return all(left < right for left, right in pairwise(distances))
 
 
 def _origin(cg: CompGraph, token: str, unsteady: Collection[str]) -> str:
@@ -234,7 +256,7 @@ def replay_isolated(
     python
         The interpreter, this one without.
     environment, cwd
-        The variables and the working folder of the process; this environment and a new folder without.
+        The variables and the working folder of the process; the usual ones and a new folder without.
 
     Raises
     ------
@@ -249,7 +271,7 @@ def replay_isolated(
             done = subprocess.run(  # noqa: S603 - an interpreter, a module of ours
                 [python, "-s", "-P", "-m", "epypes.bundle.replay", str(folder.resolve()), str(out), *options],
                 cwd=cwd or scratch,
-                env=without_python() if environment is None else environment,
+                env=usual_environment() if environment is None else environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=timeout_s,
@@ -265,25 +287,21 @@ def replay_isolated(
     if "error" in outcome:
         raise BundleError(folder, outcome["error"])
     found = tuple(Difference(**entry) for entry in outcome.pop("differences"))
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in outcome.items()
-    }
-    return ReplayReport(differences=found, **values)
+    return ReplayReport(differences=found, **outcome)
 
 
-def without_python() -> dict[str, str]:
-    """Return the environment without the variables that Python reads."""
-    return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+def usual_environment() -> dict[str, str]:
+    """Return the environment of a replay under usual conditions: this one, without what changes Python itself."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    return {**kept, "PYTHONHASHSEED": "0"}
 
 
 def main(arguments: Sequence[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
     try:
-        if "--record" in arguments:
-            outcome = asdict(record_again(read_bundle(folder, compare=False)))
-        else:
-            outcome = asdict(_watched(folder))
+        report = record_again(read_bundle(folder, compare=False)) if "--record" in arguments else _watched(folder)
+        outcome = asdict(report)
     except EpypesError as error:
         outcome = {"error": str(error)}
     except BaseException as error:
@@ -296,23 +314,22 @@ def _watched(folder: Path) -> ReplayReport:
     """Replay, and report what was imported, which files were opened, and which lines did not run."""
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
-        try:
+        with contextlib.suppress(EpypesError):
             sample = load_sample(path)
             list(differences(sample, sample))
-        except EpypesError:
-            break
     before = frozenset(sys.modules)
-    with FileAccess(folder) as access, LineCoverage(folder / MODULE) as coverage:
-        bundle = read_bundle(folder, compare=False)
-        access.also_in(bundle.settings.hyperparameters)
-        fingerprints = _fingerprints(bundle)
-        report = replay(bundle, twice=True)
+    access, ran = FileAccess(folder), trace_lines(folder / MODULE)
+    bundle = read_bundle(folder, compare=False)
+    access.note_names(bundle.settings.hyperparameters)
+    fingerprints = _fingerprints(bundle)
+    report = replay(bundle, twice=True)
+    sys.settrace(None)
     named = imported_names((folder / MODULE).read_text(encoding="utf-8"))
     return replace(
         report,
         outside=access.files,
         requirements=requirement_lines(named | (sys.modules.keys() - before)),
-        notes=(coverage.note,) if coverage.note else (),
+        notes=_unproved_lines(ran),
         library_settings=library_settings(),
         fingerprints=fingerprints,
     )
@@ -338,11 +355,42 @@ def _describe(error: BaseException, folder: Path) -> str:
             ". Only installed packages can be imported in a bundle: install what its requirements.txt lists, "
             "or move the code into the notebook"
         )
-    elif (
-        isinstance(error, FileNotFoundError) and error.filename and not Path(os.fsdecode(error.filename)).is_absolute()
-    ):
+    elif isinstance(error, FileNotFoundError) and not os.path.isabs(os.fsdecode(error.filename or os.sep)):
         text += ". A replay runs in another working folder than the notebook"
     return f"{text} ({notes})" if notes else text
+
+
+def trace_lines(path: Path) -> dict[CodeType, set[int]]:
+    """Note from now on which lines of a module's functions run, in this thread and in those that begin later."""
+    ran: dict[CodeType, set[int]] = {}
+
+    def on_event(frame: FrameType, event: str, argument: Any) -> Any:
+        code = frame.f_code
+        if code.co_filename != str(path) or not code.co_flags & inspect.CO_OPTIMIZED:
+            return None  # another file, or the body of a module or class
+        ran.setdefault(code, {code.co_firstlineno}).add(frame.f_lineno)
+        return on_event
+
+    sys.settrace(on_event)
+    threading.settrace(on_event)
+    return ran
+
+
+def _unproved_lines(ran: Mapping[CodeType, Collection[int]]) -> list[str]:
+    """Return the lines that were left out of functions that ran, as a sentence, if there are any."""
+    every = {line for code in ran for _, _, line in code.co_lines() if line}
+    missed = sorted(every.difference(*ran.values()))
+    grouped = groupby(enumerate(missed), key=lambda numbered: numbered[1] - numbered[0])
+    spans = [[line for _, line in group] for _, group in grouped]
+    if not spans:
+        return []
+    named = ", ".join(f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans[:_MOST_NAMED])
+    more = " and others" if len(spans) > _MOST_NAMED else ""
+    text = f"No sample runs these lines of {MODULE}, so no replay proves them: {named}{more}."
+    return [f"{text} Give payloads that do: samples=[...]."]
+
+
+# -- what is watched -------------------------------------------------------------------------------------------------
 
 
 def library_settings() -> dict[str, str]:
@@ -360,64 +408,115 @@ def library_settings() -> dict[str, str]:
     return found
 
 
-_Trace = Callable[[FrameType, str, Any], Any]
+class FileAccess:
+    """Notes from now on which files outside of a bundle its functions open.
 
-
-class LineCoverage:
-    """Records, while its block runs, which lines of a module's functions run, in every thread that begins meanwhile.
+    An audit hook receives every file that Python opens. Libraries in C open files without it, so their names are looked
+    for in the text of the module and in the values of hyperparameters.
 
     Parameters
     ----------
-    path
-        The file of the module, as its code names it.
+    folder
+        The bundle.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = str(path)
-        self._run: dict[CodeType, set[int]] = {}
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._opened: dict[str, str] = {}
+        self._made: set[str] = set()
+        # By path: what names it, and when it was written last.
+        self._named: dict[str, tuple[str, int]] = {}
+        sys.addaudithook(self._on_event)
 
-    def __enter__(self) -> Self:
-        self._before: tuple[Any, Any] = sys.gettrace(), threading.gettrace()
-        sys.settrace(self._called)
-        threading.settrace(self._called)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        sys.settrace(self._before[0])
-        threading.settrace(self._before[1])
-
-    def _called(self, frame: FrameType, event: str, argument: Any) -> _Trace | None:
-        code = frame.f_code
-        if code.co_filename != self._file or not code.co_flags & inspect.CO_OPTIMIZED:
-            return None  # another file, or the body of a module or class
-        lines = self._run.setdefault(code, {code.co_firstlineno})
-
-        def at_line(frame: FrameType, event: str, argument: Any) -> _Trace:
-            lines.add(frame.f_lineno)
-            return at_line
-
-        return at_line
+    def note_names(self, hyperparameters: Mapping[str, Any]) -> None:
+        """Note the files that the text of the module and values of hyperparameters name by an absolute path."""
+        named = [*_texts_of(self._folder)]
+        for token, value in hyperparameters.items():
+            named += [(text, f"Hyperparameter {token!r} (pipeline.toml)") for text in _texts_in(value)]
+        for text, what in named:
+            # A folder such as /tmp or /data is on every machine, or is part of a longer name.
+            if os.path.isabs(text) and Path(text).parts[2:] and os.path.exists(text):
+                self._named.setdefault(text, (what, os.stat(text).st_mtime_ns))
 
     @property
-    def note(self) -> str:
-        """The lines that were left out of functions that ran, as a sentence; "" if there are none."""
-        spans = [span for code in self._run for span in _spans(code, self._run[code])]
-        if not spans:
-            return ""
-        named = ", ".join(spans[:_MOST_NAMED]) + (" and others" if len(spans) > _MOST_NAMED else "")
-        return (
-            f"No sample runs these lines of {Path(self._file).name}, so no replay proves them: {named}. "
-            "Give payloads that do: samples=[...]."
+    def files(self) -> tuple[str, ...]:
+        """Why the bundle is not alone: a sentence for each file that is not its own."""
+        found = {path: f"{what} opens {path}." for path, what in self._opened.items() if path not in self._made}
+        for text, (what, written_ns) in self._named.items():
+            # A file that has changed meanwhile was written, not read.
+            if os.path.exists(text) and os.stat(text).st_mtime_ns == written_ns:
+                found.setdefault(os.path.realpath(text), f"{what} names {text}, which is there.")
+        own = self._own_folders()
+        return tuple(
+            f"{reason} {_WAY_OUT}"
+            for path, reason in found.items()
+            if os.path.exists(path) and not own & {path, *map(str, Path(path).parents)}
         )
 
+    def _own_folders(self) -> set[str]:
+        """Return the folders whose files are there wherever the bundle's requirements are."""
+        home = Path("~").expanduser()
+        packages = (module for name, module in [*sys.modules.items()] if "." not in name)
+        folders = [
+            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, *_SYSTEM),
+            *(folder for module in packages for folder in getattr(module, "__path__", ())),
+            *(os.environ.get("XDG_CACHE_HOME", home / ".cache"), os.environ.get("XDG_CONFIG_HOME", home / ".config")),
+        ]
+        return {os.path.realpath(folder) for folder in folders} - {os.sep, os.path.realpath(home)}
 
-def _spans(code: CodeType, run: set[int]) -> list[str]:
-    """Return the lines of one function that did not run, adjacent ones as one span."""
-    every = {line for _, _, line in code.co_lines() if line}
-    missed = sorted(every - run)
-    grouped = groupby(enumerate(missed), key=lambda numbered: numbered[1] - numbered[0])
-    spans = [[line for _, line in group] for _, group in grouped]
-    return [f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans]
+    def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
+        if event not in _EVENTS or not isinstance(given[0], str | bytes | os.PathLike):
+            return
+        if what := self._running_function():
+            path = os.path.realpath(os.fsdecode(given[0]))
+            flags = given[2] if event == "open" and isinstance(given[2], int) else 0
+            if flags & os.O_CREAT or not os.path.exists(path):
+                self._made.add(path)
+            else:
+                self._opened.setdefault(path, what)
+
+    def _running_function(self) -> str:
+        """Return which function of the bundle is running; "" if none is, or it is importing a module."""
+        frame: FrameType | None = sys._getframe(2)
+        while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+            file, name = Path(frame.f_code.co_filename), frame.f_code.co_name
+            if file.parent == self._folder:
+                return f"{'The module' if name == '<module>' else f'{name}()'} ({file.name}, line {frame.f_lineno})"
+            frame = frame.f_back
+        return ""
+
+
+def named_here(folder: Path) -> list[str]:
+    """Return a sentence for each text of a bundle that names a file in the current folder, which a replay has not."""
+    return [
+        f"{what} names {text!r}, a file in the current folder here. The current folder is another one there. {_WAY_OUT}"
+        for text, what in _texts_of(folder)
+        if text.strip("./ ") and not os.path.isabs(text)
+        if os.path.isfile(text) or (os.sep in text and os.path.isdir(text))
+    ]
+
+
+def _texts_of(folder: Path) -> Iterator[tuple[str, str]]:
+    """Give the strings in a bundle's module with the function that has each; not those that nothing reads."""
+    module = folder / "pipeline.py"
+    tree = ast.parse(module.read_bytes())
+    functions: dict[ast.AST, str] = {}
+    unread: set[ast.AST] = set()
+    for node in ast.walk(tree):  # a function before the functions in it
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            functions |= dict.fromkeys(ast.walk(node), f"{node.name}()")
+        elif isinstance(node, ast.Expr):  # a docstring is one
+            unread.add(node.value)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in unread:
+            yield node.value, f"{functions.get(node, 'The module')} ({module.name}, line {node.lineno})"
+
+
+def _texts_in(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | tuple | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _texts_in(part)
 
 
 # -- verification --------------------------------------------------------------------------------------------------
@@ -477,28 +576,22 @@ def verify(
         if report.identical:
             raise BundleChanged(folder, f"{change} It still computes what was recorded.")
         raise ReplayDiffers(folder, replace(report, causes=(str(change),)))
-    notes = (
-        *_pinned_otherwise(folder, report),
-        *environment_differences(recorded_environment(folder), report.environment),
-    )
+    notes = _pinned_otherwise(folder, report)
+    notes += environment_differences(recorded_environment(folder), report.environment)
     if report.identical:
         return replace(report, notes=(*report.notes, *report.outside, *notes))
     tokens = ", ".join(dict.fromkeys(repr(entry.token) for entry in report.differences if entry.function))
-    causes = (*([_UNSTEADY.format(tokens)] if tokens else []), *notes)
-    raise ReplayDiffers(folder, replace(report, causes=causes or (_UNKNOWN,)))
+    causes = [_UNSTEADY.format(tokens), *notes] if tokens else notes
+    raise ReplayDiffers(folder, replace(report, causes=causes or [_UNKNOWN]))
 
 
 def _pinned_otherwise(folder: Path, report: ReplayReport) -> list[str]:
     """Return as sentences which packages are not as pinned."""
-    try:
-        lines = (folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return []
-    pinned, imported = pins(lines), pins(report.requirements)
+    pinned, imported = read_pins(folder), pins(report.requirements)
     found = [
         f"{REQUIREMENTS} pins {name} {version}, and {imported[name]} is imported here."
         for name, version in pinned.items()
-        if name in imported and imported[name] != version
+        if imported.get(name, version) != version
     ]
     missing = sorted(imported.keys() - pinned.keys())
     return found + ([f"{REQUIREMENTS} does not name what is imported: {', '.join(missing)}."] if missing else [])

@@ -12,7 +12,6 @@ import re
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import metadata
@@ -58,7 +57,7 @@ def imported_names(text: str) -> frozenset[str]:
 def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:
     """Return the lines of requirements.txt for modules and what their distributions require: pinned, sorted.
 
-    What EPypes needs itself is not among them, unless a package of the bundle needs it too: it comes with EPypes.
+    What EPypes needs itself is not among them, unless a package of the bundle needs it too, as OpenCV needs NumPy.
     Names that nothing on this machine has are passed over: the module may have two ways, of which this machine has one.
     """
     # By distribution: those that have overwritten its files, or were overwritten by it.
@@ -86,16 +85,22 @@ def _requires(name: str) -> Iterator[str]:
 @cache
 def _owners(module: str) -> tuple[str, ...]:
     """Return the distributions that have brought the file of a module, the one whose files are there now first."""
-    top, file = module.partition(".")[0], _file(module)
-    if top == _OURS or not file:
-        return (_OURS,) if top == _OURS else ()
-    candidates = bringing(top)
-    if not candidates:
-        return tuple(name for folder, name in _editable().items() if _is_in(file, folder))[:1]
-    if len(candidates) > 1:
-        candidates = tuple(name for name in candidates if file in _files(name)) or candidates
-    # Each has overwritten the files of the others; the hashes in its record are of what it had brought.
-    return tuple(sorted(candidates, key=lambda name: -_agreeing(name, top) if len(candidates) > 1 else 0))
+    top = module.partition(".")[0]
+    if top == _OURS:
+        return (_OURS,)
+    try:
+        spec = importlib.util.find_spec(module)  # imports the package of the module, and not the module
+    except Exception:  # there is none, or whatever its package raises
+        return ()
+    file = Path(spec.origin).resolve() if spec and spec.origin else None
+    if file is None or not file.is_file():
+        return ()
+    names = bringing(top) or tuple(name for folder, name in _checkouts() if file.is_relative_to(folder))[:1]
+    if len(names) > 1:  # parts of a namespace, or twins, which have overwritten the files of each other
+        brought = {name: _files(name, top) for name in names}
+        names = tuple(name for name in names if file in brought[name]) or names
+        names = tuple(sorted(names, key=lambda name: -_unchanged(brought[name]) if len(names) > 1 else 0))
+    return names
 
 
 def bringing(top: str) -> tuple[str, ...]:
@@ -110,55 +115,37 @@ def _by_module() -> dict[str, tuple[str, ...]]:
     return {top: tuple(sorted({*map(canonicalize_name, names)})) for top, names in found}
 
 
-def _file(module: str) -> str:
-    """Return the file of a module, which is not imported for it; its package is."""
-    try:
-        spec = importlib.util.find_spec(module)
-    except Exception:  # it has none, or whatever its package raises
-        return ""
-    origin = spec.origin if spec else None
-    return str(Path(origin).resolve()) if origin and Path(origin).is_file() else ""
-
-
-def _is_in(file: str, folder: str) -> bool:
-    # What is installed into an environment inside the folder is not of the folder.
-    return Path(file).is_relative_to(folder) and "site-packages" not in Path(file).relative_to(folder).parts
+@cache
+def _checkouts() -> list[tuple[Path, str]]:
+    """Return the folders of the distributions that are installed as editable; no file of theirs is recorded."""
+    sources = ((_install_source(distribution), distribution.name) for distribution in metadata.distributions())
+    return [
+        (Path(unquote(urlsplit(source["url"]).path)).resolve(), canonicalize_name(name))
+        for source, name in sources
+        if source.get("dir_info", {}).get("editable")
+    ]
 
 
 @cache
-def _files(name: str) -> frozenset[str]:
-    return frozenset(str(Path(str(path.locate())).resolve()) for path in metadata.files(name) or ())
+def _files(name: str, top: str) -> dict[Path, metadata.FileHash | None]:
+    """Return the hashes of the files that a distribution has brought below a top-level module."""
+    files = (path for path in metadata.files(name) or () if path.parts[0] == top)
+    return {Path(str(path.locate())).resolve(): path.hash for path in files}
 
 
-def _agreeing(name: str, top: str) -> int:
-    """Return how many of a distribution's files have the content that it brought."""
+def _unchanged(files: Mapping[Path, metadata.FileHash | None]) -> int:
+    """Return how many files have the content that their distribution brought."""
     count = 0
-    for path in metadata.files(name) or ():
-        if path.parts[0] == top and path.hash:
-            with contextlib.suppress(OSError):
-                content = hashlib.new(path.hash.mode, Path(str(path.locate())).read_bytes()).digest()
-                count += base64.urlsafe_b64encode(content).decode().rstrip("=") == path.hash.value
+    for path, recorded in files.items():
+        if recorded and path.is_file():
+            content = hashlib.new(recorded.mode, path.read_bytes()).digest()
+            count += base64.urlsafe_b64encode(content).decode().rstrip("=") == recorded.value
     return count
-
-
-@cache
-def _editable() -> dict[str, str]:
-    """Return the distributions that are installed as editable, by folder."""
-    found: dict[str, str] = {}
-    for distribution in metadata.distributions():
-        source = _install_source(distribution)
-        if source.get("dir_info", {}).get("editable"):
-            found[str(Path(unquote(urlsplit(source["url"]).path)).resolve())] = canonicalize_name(distribution.name)
-    return found
 
 
 def _install_source(distribution: metadata.Distribution) -> dict[str, Any]:
     """Return what PEP 610's direct_url.json says, {} for what comes from an index."""
-    try:
-        found = json.loads(distribution.read_text("direct_url.json") or "{}")
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) and isinstance(found.get("url"), str) else {}
+    return json.loads(distribution.read_text("direct_url.json") or "{}")  # type: ignore[no-any-return]
 
 
 def _lines(name: str, twins: Collection[str]) -> Iterator[str]:
@@ -182,6 +169,20 @@ def pins(lines: Iterable[str]) -> dict[str, str]:
     return {canonicalize_name(pin[1]): pin[2] for pin in found if pin}
 
 
+def read_pins(folder: Path) -> dict[str, str]:
+    """Return the pins of a bundle's requirements.txt.
+
+    Raises
+    ------
+    BundleError
+        It can't be read.
+    """
+    try:
+        return pins((folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines())
+    except (OSError, UnicodeDecodeError) as error:
+        raise BundleError(folder, f"{folder / REQUIREMENTS} can't be read: {error}. Promote again.") from error
+
+
 # -- a fresh environment ---------------------------------------------------------------------------------------------
 
 
@@ -194,20 +195,13 @@ def fresh_environment(folder: Path) -> Iterator[str]:
     BundleError
         No environment can be made, or something can't be installed.
     """
-    try:
-        pinned = pins((folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines())
-    except (OSError, UnicodeDecodeError) as error:
-        raise BundleError(folder, f"{folder / REQUIREMENTS} can't be read: {error}. Promote again.") from error
+    pinned = read_pins(folder)
     with tempfile.TemporaryDirectory(prefix="epypes-fresh-") as scratch:
         home = Path(scratch) / "env"
         python = str(home / "bin" / "python")
         pip = [python, "-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input"]
-        until = time.monotonic() + INSTALL_TIMEOUT_S
-        for what, command in (
-            ("A new environment can't be made", [sys.executable, "-I", "-m", "venv", str(home)]),
-            ("What requirements.txt names can't be installed", [*pip, *_wanted(pinned)]),
-        ):
-            _run(folder, what, command, until - time.monotonic())
+        _run(folder, "A new environment can't be made", [sys.executable, "-I", "-m", "venv", str(home)])
+        _run(folder, "What requirements.txt names can't be installed", [*pip, *_wanted(pinned)])
         yield python
 
 
@@ -229,32 +223,28 @@ def epypes_source(pinned: Mapping[str, str]) -> str:
 
 def _source(name: str, version: str) -> str:
     """Return where to install a distribution from: where it was installed from here, if that was no index."""
-    try:
+    with contextlib.suppress(metadata.PackageNotFoundError):
         distribution = metadata.distribution(name)
-    except metadata.PackageNotFoundError:
-        return f"{name}=={version}"
-    source = _install_source(distribution)
-    # Another version than is installed here can only come from an index; of EPypes it is the one that runs now.
-    if not source or (distribution.version != version and name != _OURS):
-        return f"{name}=={version}"
-    address = urlsplit(source["url"])
-    if address.scheme == "file":
-        return unquote(address.path)
-    commit = source.get("vcs_info", {}).get("commit_id")
-    return f"{name} @ {source['vcs_info']['vcs']}+{source['url']}@{commit}" if commit else f"{name} @ {source['url']}"
+        source = _install_source(distribution)
+        # Another version than is installed here can only come from an index; of EPypes it is the one that runs now.
+        if source and (distribution.version == version or name == _OURS):
+            address = urlsplit(source["url"])
+            if address.scheme == "file":
+                return unquote(address.path)
+            vcs = source.get("vcs_info")
+            return f"{name} @ {vcs['vcs']}+{source['url']}@{vcs['commit_id']}" if vcs else f"{name} @ {source['url']}"
+    return f"{name}=={version}"
 
 
-def _run(folder: Path, what: str, command: list[str], timeout_s: float) -> None:
+def _run(folder: Path, what: str, command: list[str]) -> None:
     """Run a command; raise BundleError with a sentence of why it failed, without the addresses of what it asked."""
     try:
         done = subprocess.run(  # noqa: S603 - venv or pip of this interpreter
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=max(timeout_s, 0.0), check=False
+            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=INSTALL_TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired as error:
         text = f"{what} within {INSTALL_TIMEOUT_S:g} s. Try again, or verify without --fresh-env."
         raise BundleError(folder, f"{folder}: {text}") from error
-    except OSError as error:
-        raise BundleError(folder, f"{folder}: {what}: {error}.") from error
     if done.returncode == 0:
         return
     output = done.stderr.decode(errors="replace")

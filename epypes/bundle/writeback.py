@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from epypes.bundle.determinism import prove
+from epypes.bundle.draft import draft_folder, swap_folders
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest, digest
-from epypes.bundle.proof import draft_folder, prove, swap_folders
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.bundle.settings import alike, fits, read, written
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName

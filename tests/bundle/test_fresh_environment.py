@@ -1,4 +1,4 @@
-"""Does a bundle compute the same where nothing is installed but what its requirements.txt names?"""
+"""A bundle computes the same where nothing is installed but what its requirements.txt names."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def test_an_editable_install_is_named_with_a_comment(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("fresh_interpreter")
-def test_python_itself_and_what_nobody_installed_are_no_requirements(tmp_path):
+def test_python_itself_and_modules_without_a_distribution_are_no_requirements(tmp_path):
     (tmp_path / "loose.py").write_text("")
     assert requirements(tmp_path, "json", "email.message", "loose") == []
 

@@ -1,4 +1,4 @@
-"""Does verify name what was broken: a constant, an expected output, a sample, a pin, another machine?"""
+"""Verification names what was broken: a constant, an expected output, a sample, a pin, another machine."""
 
 from __future__ import annotations
 
@@ -79,10 +79,10 @@ def refused(folder):
 def test_a_changed_constant_is_named_with_its_line_and_the_first_difference(folder):
     change(folder / "pipeline.py", "OFFSET = 40", "OFFSET = 41")
     line = (folder / "pipeline.py").read_text().splitlines().index("OFFSET = 41") + 1
-    said = refused(folder)
-    assert f"pipeline.py was changed at line {line}: OFFSET = 41" in said
-    assert "sample 000, token 'marked': " in said
-    assert "values differ, first at [" in said
+    text = refused(folder)
+    assert f"pipeline.py was changed at line {line}: OFFSET = 41" in text
+    assert "sample 000, token 'marked': " in text
+    assert "values differ, first at [" in text
     write_manifest(folder)
     with pytest.raises(ReplayDiffers) as caught:
         verify(folder)
@@ -96,7 +96,7 @@ def test_a_sample_that_cannot_be_read_any_more_is_named_with_why(folder):
     assert "It can't be replayed" in refused(folder)
 
 
-def test_a_changed_comment_is_found_and_said_to_change_nothing(folder):
+def test_a_changed_comment_is_found_and_changes_no_token(folder):
     change(folder / "pipeline.py", "OFFSET = 40", "OFFSET = 40  # brighter")
     assert "at line" in refused(folder)
     assert refused(folder).endswith("promote again. It still computes what was recorded.")
@@ -182,7 +182,7 @@ def test_sealing_again_keeps_what_the_samples_were_recorded_on(folder):
 
 
 @pytest.mark.usefixtures("fresh_interpreter")
-def test_values_that_differ_from_run_to_run_are_said_to(folder):
+def test_values_that_differ_from_run_to_run_are_named_as_such(folder):
     change(folder / "pipeline.py", "smoothed > OFFSET", "smoothed > OFFSET + np.random.randint(0, 60, smoothed.shape)")
     write_manifest(folder)
     text = refused(folder)
@@ -229,7 +229,7 @@ def test_an_older_manifest_without_comments_is_a_bundle_still(folder):
 
 
 @pytest.mark.usefixtures("fresh_interpreter")
-def test_threads_of_opencv_are_told_as_they_are(folder):
+def test_the_number_of_threads_of_opencv_is_reported(folder):
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
