@@ -8,24 +8,20 @@ other pictures of a notebook: pictures become smaller first, then those at the e
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any, Final
+from typing import Final
 
 from epypes.batch.grid import identity
-from epypes.batch.results import Outcome, Thumbnail, data_uri
+from epypes.batch.results import Outcome, short_text
+from epypes.batch.thumbnails import Thumbnail, data_uri, smaller
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.display.markup import content, escape, fitted, size
-from epypes.display.previews.preview import sketch
-from epypes.display.previews.raster import encode_small
 from epypes.display.previews.short import reason
-from epypes.display.previews.shown import Look
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
-from epypes.optional import optional_import
 from epypes.wording import counted
 
 
@@ -227,11 +223,6 @@ def _tile(place: int, outcome: Outcome, label: str, shown: str | None) -> Tile:
     return Tile(place, label, text, False, thumbnail)
 
 
-def short_text(value: Any) -> str:
-    """Return a value in at most 30 characters."""
-    return sketch(value, Look()).shown.text
-
-
 def _pictured(cg: CompGraph, outcomes: Sequence[Outcome]) -> str | None:
     """Return the last sink token that has a picture, else the last token that has one; None without any."""
     pictured = frozenset[str]().union(*(outcome.thumbnails for outcome in outcomes))
@@ -262,8 +253,6 @@ def _require_shown(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> st
 
 # The number of tiles at most; fewer if their texts are long.
 _MOST_TILES: Final = (120, 80, 50, 25, 10, 3)
-# What a smaller picture shows is hardly seen.
-_LEAST_BYTES: Final = 400
 _ELEMENT_CHARACTERS: Final = 60
 _LABEL_ROOM: Final = 64
 _MESSAGE_ROOM: Final = 96
@@ -367,18 +356,3 @@ def _paint_cell(tag: str, tiles: Cell, most_bytes: int, chosen: int | None) -> s
             alt = escape(fitted(tile.text, _LABEL_ROOM))
             painted += f'<img src="{data_uri(picture)}" alt="{alt}" title="{alt}">{label}'
     return f'<{tag} class="cell{state}">{painted}</{tag}>'
-
-
-def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:
-    """Return a picture within so many bytes; None if nothing would be seen on it."""
-    if len(thumbnail.data) <= most_bytes:
-        return thumbnail
-    if most_bytes < _LEAST_BYTES or thumbnail.media_type == "image/svg+xml":
-        return None
-    with optional_import("scale"):
-        from PIL import Image
-
-    with Image.open(io.BytesIO(thumbnail.data)) as opened:
-        opened.load()
-        encoded = encode_small(opened, most_bytes)
-    return replace(thumbnail, media_type=encoded.media_type, data=encoded.data)
