@@ -8,19 +8,21 @@ and the state of the lists, arrays and objects that functions use. What can't be
 from __future__ import annotations
 
 import enum
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Self
 from warnings import warn
 
+from epypes.batch.cases import Case
+from epypes.batch.grid import Axis, ChoiceAxis
 from epypes.batch.items import Item
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
 from epypes.bundle.fingerprint import Digester, combined_digest, file_digest, versions_of
-from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
+from epypes.errors import EpypesError, PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array
@@ -62,20 +64,15 @@ class Fingerprint:
     reader: str
 
 
-def source_of(cg: CompGraph) -> str | None:
-    """Return a graph as the text that promotion writes; None if that is refused."""
-    try:
-        return to_source(cg)
-    except (SourceRefused, PlaceholderNeeded):
-        return None
-
-
 def graph_fingerprint(cg: CompGraph) -> Fingerprint:
     """Return the fingerprint of what a graph computes."""
     digester = Digester()
     digester.add(cg)
     # An object whose content can't be digested, as a detector of OpenCV, counts by the expression that makes it.
-    source = (source_of(cg) or "") if digester.unknown else ""
+    source = ""
+    if digester.unknown:
+        with suppress(SourceRefused, PlaceholderNeeded):
+            source = to_source(cg)
     code = combined_digest("graph", source, digester.code.digest(), *versions_of(digester.modules)).hex()
     state = combined_digest("state", digester.state.digest(), *versions_of(digester.state_modules)).hex()
     return Fingerprint(code, state, "" if source else digester.unknown, digester.reader)
@@ -154,6 +151,88 @@ def _is_short(value: Any) -> bool:
     return type(value) in _SHORT and not (type(value) is int and value.bit_length() > _SHOWN_CHARACTERS * 4)
 
 
+# -- searches -------------------------------------------------------------------------------------------------------
+
+
+def code_digests(cg: CompGraph, metric: Any, keep: Sequence[str], *, is_named: bool) -> dict[str, str]:
+    """Return the digests of a search's graph, and of its metric and the tokens that it is given.
+
+    As `search_digests`.
+    """
+
+    def of_graph() -> str:
+        found = graph_fingerprint(cg)
+        if found.unknown or found.reader:
+            raise NoDigest(found.unknown or reader_text(found.reader))
+        return combined_digest("graph", found.code, found.state).hex()
+
+    def of_metric() -> str:
+        return combined_digest("metric", "token" if isinstance(metric, str) else function_digest(metric), *keep).hex()
+
+    return _digests({"graph": of_graph, "metric": of_metric}, is_named=is_named)
+
+
+def search_digests(
+    cg: CompGraph,
+    metric: Any,
+    keep: Sequence[str],
+    axes: Sequence[Axis],
+    hyperparameters: Mapping[str, Any],
+    items: Sequence[Item],
+    cases: Sequence[Case],
+    *,
+    is_named: bool,
+) -> dict[str, str]:
+    """Return digests of all that decides about the trials of a search, by what they are of.
+
+    Parameters
+    ----------
+    cg, metric, keep
+        The graph, what measures it, and the tokens that are measured.
+    axes, hyperparameters
+        What varies, and the values of the runner.
+    items, cases
+        The inputs of the cases, and their labels.
+    is_named
+        Whether the user has given the search a name; what has no digest has "" then.
+
+    Raises
+    ------
+    ScaleError
+        Something has no digest, and the search no name.
+    """
+    varied = {axis.token: axis.choices if isinstance(axis, ChoiceAxis) else () for axis in axes}
+    fixed = {token: value for token, value in hyperparameters.items() if token not in varied}
+    labels = [(case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in cases]
+    data = {
+        "hyperparameters": lambda: value_digest(fixed),
+        "choices": lambda: value_digest(varied),
+        "inputs of the cases": lambda: value_digest([(item.name, payload_digest(item.payload)) for item in items]),
+        "labels of the cases": lambda: value_digest(labels),
+    }
+    return code_digests(cg, metric, keep, is_named=is_named) | _digests(data, is_named=is_named)
+
+
+def _digests(ways: Mapping[str, Callable[[], str]], *, is_named: bool) -> dict[str, str]:
+    found = {}
+    for what, way in ways.items():
+        try:
+            found[what] = way()
+        except (EpypesError, NoDigest) as error:
+            if not is_named:
+                text = f"The search has no name for the store, and one can't be computed from its {what}: {error}"
+                raise ScaleError(f"{text}.\nGive one: name='...'.") from error
+            found[what] = ""
+    return found
+
+
+def search_name(metric: str, direction: str, axes: Sequence[Axis], digests: Mapping[str, str]) -> str:
+    """Return the name of a search that the user has not named: a digest of what it computes."""
+    ranges = [axis.labels if isinstance(axis, ChoiceAxis) else repr(axis) for axis in axes]
+    text = repr((direction, [axis.token for axis in axes], ranges, sorted(digests.items())))
+    return f"optimize {metric} {combined_digest('search', text).hex()[:12]}"
+
+
 # -- series ---------------------------------------------------------------------------------------------------------
 
 
@@ -206,7 +285,7 @@ def outcome_cache(
         series = _series_of(opened, kind, runner, name, varied, found)
         doubt = _doubt(found, has_name=bool(name))
         if doubt:
-            warn(doubt, stacklevel=4)
+            warn(doubt, stacklevel=5)
         shown = "" if show == () else f"show={show and list(show)}"
         with OutcomeCache(series, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
             yield cache

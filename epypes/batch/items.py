@@ -40,7 +40,7 @@ class Item:
     payload: Mapping[str, Any]
 
 
-def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) -> Iterator[Item]:
+def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     """Yield the inputs of an image set, each when the caller wants the next one.
 
     Parameters
@@ -48,12 +48,10 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
     images
         A folder, a glob, one file, or an iterable of images (arrays), paths of image files, or dicts by free source
         token, in which a Path stands for an image file, and so does a text with the ending of an image, of ``.npy`` or
-        of ``.npz`` if there is such a file; any other text stands for itself.
+        of ``.npz`` if there is such a file; any other text stands for itself. What a generator gives is copied, since
+        it may be one array that is filled again each time.
     runner
         Its free source tokens are what an item has to give.
-    is_copied
-        Whether what a generator gives is copied, since it may be one array that is filled again each time. False if
-        the caller needs no item any more when it takes the next one.
 
     Raises
     ------
@@ -64,7 +62,7 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
     if isinstance(images, str | Path):
         return _of_files(*_files(images), _only(free, f"{str(images)!r} gives one image"))
     _check_set(images)
-    return _of_values(each_copied(images) if is_copied else images, type(images).__name__, free)
+    return _of_values(_each_copied(images), type(images).__name__, free)
 
 
 def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
@@ -270,7 +268,7 @@ def holds_its_arrays(values: Any) -> bool:
     return type(values) in (list, tuple) or is_array(values)
 
 
-def each_copied(values: Iterable[Any]) -> Iterator[Any]:
+def _each_copied(values: Iterable[Any]) -> Iterator[Any]:
     """Yield the values of an iterable, copied unless it holds its arrays itself."""
     if holds_its_arrays(values):
         yield from values

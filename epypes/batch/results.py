@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, overload
 
 from epypes.batch.items import Item
 from epypes.batch.thumbnails import Thumbnail, data_uri
@@ -105,35 +108,50 @@ class Outcome:
             for token, shown in self.thumbnails.items()
         }
         return {
-            "number": self.number,
-            "name": self.name,
+            **{part.name: getattr(self, part.name) for part in fields(self) if part.name != "kept"},
             "setting": {token: _json_value(value) for token, value in self.setting.items()},
-            "values": dict(self.values),
-            "times_ns": dict(self.times_ns),
-            "total_ns": self.total_ns,
             "error_info": None if self.error_info is None else asdict(self.error_info),
             "thumbnails": thumbnails,
-            "texts": dict(self.texts),
         }
 
     @staticmethod
     def from_json(data: Mapping[str, Any], item: Item, setting: Mapping[str, Any]) -> Outcome:
         """Return the outcome that ``to_json`` wrote, for the item and the setting that it was looked up for."""
         info = data["error_info"]
-        return Outcome(
-            item.number,
-            item.name,
-            setting,
-            dict(data["values"]),
-            dict(data["times_ns"]),
-            data["total_ns"],
-            None if info is None else ErrorInfo(**info),
-            {
-                token: Thumbnail(**{**shown, "data": base64.b64decode(shown["data"])})
-                for token, shown in data["thumbnails"].items()
-            },
-            texts=dict(data["texts"]),
-        )
+        thumbnails = {
+            token: Thumbnail(**{**shown, "data": base64.b64decode(shown["data"])})
+            for token, shown in data["thumbnails"].items()
+        }
+        found = {
+            "number": item.number,
+            "name": item.name,
+            "setting": setting,
+            "error_info": None if info is None else ErrorInfo(**info),
+            "thumbnails": thumbnails,
+        }
+        return Outcome(**{**data, **found})
+
+
+class OutcomeSequence(Sequence[Outcome]):
+    """The outcomes of a map or a sweep; ``outcomes`` has them as a tuple."""
+
+    __slots__ = ()
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def failures(self) -> tuple[Outcome, ...]:
+        """The outcomes of what could not be read or on which a function failed."""
+        return tuple(outcome for outcome in self.outcomes if outcome.has_failed)
+
+    @overload
+    def __getitem__(self, index: int) -> Outcome: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Outcome, ...]: ...
+    def __getitem__(self, index: int | slice) -> Outcome | tuple[Outcome, ...]:
+        return self.outcomes[index]
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
 
 
 def short_value(value: Any) -> Any:
@@ -171,7 +189,7 @@ FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 def outcomes_frame(
-    outcomes: Sequence[Outcome], cg: CompGraph | None = None, extra: Mapping[str, Sequence[Any]] | None = None
+    outcomes: Sequence[Outcome], cg: CompGraph, extra: Mapping[str, Sequence[Any]] = MappingProxyType({})
 ) -> pd.DataFrame:
     """Return a table with one row per outcome.
 
@@ -180,7 +198,7 @@ def outcomes_frame(
     outcomes
         The rows.
     cg
-        Gives the order of sink tokens and functions; without, it is the one in which outcomes have them.
+        The graph, which gives the order of sink tokens and functions.
     extra
         Columns by name, each with a value per outcome; they stand after ``name``.
 
@@ -190,21 +208,19 @@ def outcomes_frame(
         ``name``, the extra columns, ``failure`` (None, or what failed), one column per sink token, ``total_ms``, and
         ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
     """
-    columns: dict[str, Sequence[Any]] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= {column: object_column(values) for column, values in (extra or {}).items()}
+    columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
+    columns |= {column: object_column(values) for column, values in extra.items()}
     columns["failure"] = object_column(
         [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
     )
-    tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
-    functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
-    for token in tokens:
+    for token in cg.sink_tokens:
         is_taken = token in columns or token in FIXED_COLUMNS
         columns[f"{token} (token)" if is_taken else token] = _column(
             [outcome.values.get(token) for outcome in outcomes]
         )
     columns["total_ms"] = [outcome.total_ns / 1e6 for outcome in outcomes]
-    for function in functions:
-        columns[f"{function} ms"] = [_in_ms(outcome.times_ns.get(function)) for outcome in outcomes]
+    for function in cg.functions:
+        columns[f"{function} ms"] = [outcome.times_ns.get(function, math.nan) / 1e6 for outcome in outcomes]
     return frame_of(columns)
 
 
@@ -218,36 +234,21 @@ def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
 def _column(values: list[Any]) -> Any:
     """Return values as a column; integers and truth values of which some are missing stay what they are."""
     kinds = {type(value) for value in values if value is not None}
-    if None in values and len(kinds) == 1 and kinds <= {bool, int}:
+    if None in values and kinds in ({bool}, {int}):
         with optional_import():
             import pandas as pd
-        try:
+        with suppress(OverflowError):  # above 64 bits
             return pd.array(values, dtype="boolean" if bool in kinds else "Int64")
-        except OverflowError:  # above 64 bits
-            return values
     return values
 
 
 def object_column(values: Sequence[Any]) -> Any:
     """Return values as a column; where None is one of them it stays None, since NaN is another value."""
-    has_none = any(value is None for value in values)
-    if not has_none:
+    if not any(value is None for value in values):
         return values
     with optional_import():
         import pandas as pd
     return pd.Series(list(values), dtype=object)
-
-
-def _in_ms(duration_ns: int | None) -> float:
-    return float("nan") if duration_ns is None else duration_ns / 1e6
-
-
-def _all(found: Iterable[Mapping[str, Any]], first: Iterable[str]) -> list[str]:
-    """Return the names in all mappings: those of ``first`` in that order, then the others as they come."""
-    order = dict.fromkeys(first)
-    for names in found:
-        order |= dict.fromkeys(names)
-    return list(order)
 
 
 # -- tables as HTML -----------------------------------------------------------------------------------------------

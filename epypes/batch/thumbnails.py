@@ -88,7 +88,8 @@ def _as_file(sketched: Sketch) -> Thumbnail | str:
         return Thumbnail(shown.picture.media_type, shown.picture.data, caption)
     if shown.chart is None:
         return shown.text
-    size, painted = f'width="{THUMB_WIDTH}" height="{THUMB_HEIGHT}"', paint_thumbnail(shown, (THUMB_WIDTH / 2, 0))
+    size = f'width="{THUMB_WIDTH}" height="{THUMB_HEIGHT}" viewBox="0 0 {THUMB_WIDTH} {THUMB_HEIGHT}"'
+    painted = paint_thumbnail(shown, (THUMB_WIDTH / 2, 0))
     chart = f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{_CHART_STYLE}{painted}</svg>'
     return Thumbnail("image/svg+xml", chart.encode(), caption)
 
