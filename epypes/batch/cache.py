@@ -16,8 +16,6 @@ from time import monotonic
 from typing import Any, Final, Self
 from warnings import warn
 
-from epypes.batch.cases import Case
-from epypes.batch.grid import Axis, ChoiceAxis
 from epypes.batch.items import Item
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
@@ -154,45 +152,19 @@ def _is_short(value: Any) -> bool:
 # -- searches -------------------------------------------------------------------------------------------------------
 
 
-def code_digests(cg: CompGraph, metric: Any, keep: Sequence[str], *, is_named: bool) -> dict[str, str]:
-    """Return the digests of a search's graph, and of its metric and the tokens that it is given.
-
-    As `search_digests`.
-    """
-
-    def of_graph() -> str:
-        found = graph_fingerprint(cg)
-        if found.unknown or found.reader:
-            raise NoDigest(found.unknown or reader_text(found.reader))
-        return combined_digest("graph", found.code, found.state).hex()
-
-    def of_metric() -> str:
-        return combined_digest("metric", "token" if isinstance(metric, str) else function_digest(metric), *keep).hex()
-
-    return _digests({"graph": of_graph, "metric": of_metric}, is_named=is_named)
-
-
 def search_digests(
-    cg: CompGraph,
-    metric: Any,
-    keep: Sequence[str],
-    axes: Sequence[Axis],
-    hyperparameters: Mapping[str, Any],
-    items: Sequence[Item],
-    cases: Sequence[Case],
-    *,
-    is_named: bool,
+    cg: CompGraph, metric: Any, data: Mapping[str, Callable[[], Any]], *, is_named: bool
 ) -> dict[str, str]:
     """Return digests of all that decides about the trials of a search, by what they are of.
 
     Parameters
     ----------
-    cg, metric, keep
-        The graph, what measures it, and the tokens that are measured.
-    axes, hyperparameters
-        What varies, and the values of the runner.
-    items, cases
-        The inputs of the cases, and their labels.
+    cg
+        The graph.
+    metric
+        The function that measures it; the name of a token is no part of this.
+    data
+        By what it is, what returns anything else that decides about trials.
     is_named
         Whether the user has given the search a name; what has no digest has "" then.
 
@@ -201,36 +173,28 @@ def search_digests(
     ScaleError
         Something has no digest, and the search no name.
     """
-    varied = {axis.token: axis.choices if isinstance(axis, ChoiceAxis) else () for axis in axes}
-    fixed = {token: value for token, value in hyperparameters.items() if token not in varied}
-    labels = [(case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in cases]
-    data = {
-        "hyperparameters": lambda: value_digest(fixed),
-        "choices": lambda: value_digest(varied),
-        "inputs of the cases": lambda: value_digest([(item.name, payload_digest(item.payload)) for item in items]),
-        "labels of the cases": lambda: value_digest(labels),
+
+    def of_graph() -> str:
+        found = graph_fingerprint(cg)
+        if found.unknown or found.reader:
+            raise NoDigest(found.unknown or reader_text(found.reader))
+        return combined_digest("graph", found.code, found.state).hex()
+
+    ways: dict[str, Callable[[], str]] = {
+        "graph": of_graph,
+        "metric": lambda: "token" if isinstance(metric, str) else function_digest(metric),
+        **{what: lambda given=given: value_digest(given()) for what, given in data.items()},  # type: ignore[misc]
     }
-    return code_digests(cg, metric, keep, is_named=is_named) | _digests(data, is_named=is_named)
-
-
-def _digests(ways: Mapping[str, Callable[[], str]], *, is_named: bool) -> dict[str, str]:
-    found = {}
+    digests = {}
     for what, way in ways.items():
         try:
-            found[what] = way()
+            digests[what] = way()
         except (EpypesError, NoDigest) as error:
             if not is_named:
                 text = f"The search has no name for the store, and one can't be computed from its {what}: {error}"
                 raise ScaleError(f"{text}.\nGive one: name='...'.") from error
-            found[what] = ""
-    return found
-
-
-def search_name(metric: str, direction: str, axes: Sequence[Axis], digests: Mapping[str, str]) -> str:
-    """Return the name of a search that the user has not named: a digest of what it computes."""
-    ranges = [axis.labels if isinstance(axis, ChoiceAxis) else repr(axis) for axis in axes]
-    text = repr((direction, [axis.token for axis in axes], ranges, sorted(digests.items())))
-    return f"optimize {metric} {combined_digest('search', text).hex()[:12]}"
+            digests[what] = ""
+    return digests
 
 
 # -- series ---------------------------------------------------------------------------------------------------------

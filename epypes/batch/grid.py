@@ -11,7 +11,7 @@ import enum
 import math
 import numbers
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import islice, pairwise, product
@@ -290,14 +290,19 @@ def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
         raise ScaleError(
             f"No hint gives the values that {name!r} may take. Give a list of values, or a range, as (low, high)."
         )
-    if isinstance(given, range) or hasattr(given, "tolist"):
-        given = list(given) if isinstance(given, range) else given.tolist()
+    values = given
+    if hasattr(given, "tolist"):  # of numpy, as numbers of Python; of an array without axes the one that it holds
+        values = given.tolist()
+    elif isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping | tuple):
+        values = list(islice(given, MOST_OUTCOMES + 1))
     try:
-        param = as_param(given)
+        param = as_param(values)
     except (TypeError, ValueError) as error:
         raise ScaleError(f"{name}={given!r:.60}: {error}") from error
     if not isinstance(param, Param):
-        raise ScaleError(f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values.")
+        raise ScaleError(
+            f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values. Write {name}=[...]."
+        )
     return param
 
 
@@ -445,7 +450,14 @@ def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
 
 def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Grid:
     """Return the grid of each value with each other, or of the first values of all, the second ones, and so on."""
-    values = {name: _values(runner, name, of_name) for name, of_name in given.items()}
+    for name, of_name in given.items():
+        if isinstance(of_name, tuple):
+            listed = f"[{', '.join(map(repr, of_name[:4]))}{', ...' * (len(of_name) > 4)}]"
+            raise ScaleError(
+                f"{name}={of_name!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
+                f"for values between two ends how='random' with n=..."
+            )
+    values = {name: axis_of(runner, name, _param(runner, name, of_name)).values() for name, of_name in given.items()}
     lengths = {name: len(of_name) for name, of_name in values.items()}
     if how == "zip" and len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
@@ -454,35 +466,10 @@ def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Gr
             "Give as many of each."
         )
     size = max(lengths.values()) if how == "zip" else math.prod(lengths.values())
-    if size <= MOST_OUTCOMES:
-        for name, of_name in values.items():
-            _require_branches(runner, name, of_name)
     combine: Callable[..., Iterable[tuple[Any, ...]]] = zip if how == "zip" else product
     return Grid(
         tuple(values), size, lambda: tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
     )
-
-
-def _values(runner: CompGraphRunner, name: str, given: Any) -> Sequence[Any]:
-    """Return the values of one hyperparameter; if they are too many to hold, only something of at least that length."""
-    if given is None or isinstance(given, Param):
-        return axis_of(runner, name, _param(runner, name, given)).values()
-    if isinstance(given, tuple):
-        listed = f"[{', '.join(map(repr, given[:4]))}{', ...' * (len(given) > 4)}]"
-        raise ScaleError(
-            f"{name}={given!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
-            f"for values between two ends how='random' with n=..."
-        )
-    if hasattr(given, "tolist"):
-        given = given.tolist()  # of numpy, as numbers of Python; of an array without axes the one that it holds
-    if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable):
-        raise ScaleError(f"{name}={given!r:.60} is no list of values. Write {name}=[{given!r:.60}, ...].")
-    if isinstance(given, Sized) and len(given) > MOST_OUTCOMES:
-        return range(len(given))
-    values = tuple(islice(given, MOST_OUTCOMES + 1))
-    if not values:
-        raise ScaleError(f"{name} has no values. Give at least one, or leave it out of the grid.")
-    return values
 
 
 def _drawn(runner: CompGraphRunner, given: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:

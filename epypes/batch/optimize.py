@@ -18,7 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
 
-from epypes.batch.cache import code_digests, search_digests, search_name
+from epypes.batch.cache import payload_digest, search_digests
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, axes_of, bounded
@@ -27,6 +27,7 @@ from epypes.batch.job import Job, SharedStart
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome
 from epypes.batch.search_result import Direction, OptimizeResult, Trial, quiet_optuna
+from epypes.bundle.fingerprint import combined_digest
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 from epypes.optional import optional_import
@@ -144,23 +145,40 @@ def optimize(
     inputs = items_of([case.inputs for case in objective.cases], runner)
     items = [replace(item, name=case.name or item.name) for case, item in zip(objective.cases, inputs, strict=True)]
     at_once = 1 if executor is None else worker_count(executor)
-    code = runner.cg, metric, objective.keep
     with opened_store(store) as opened:
         digests, study = dict[str, str](), name or ""
         if opened is not None:
-            digests = search_digests(*code, axes, runner.hyperparameters, items, objective.cases, is_named=bool(name))
-            study = name or search_name(objective.name, direction, axes, digests)
+            data = _searched_data(axes, runner.hyperparameters, objective, items)
+            digests = search_digests(runner.cg, metric, data, is_named=bool(name))
+            text = repr((direction, axes, sorted(digests.items())))
+            study = name or f"optimize {objective.name} {combined_digest('search', text).hex()[:12]}"
         search = _Search(axes, runner.hyperparameters, direction, seed, at_once, opened, study, digests)
         with contextlib.closing(search):
             was_stopped = _searched(search, _Work(runner, objective, items, executor, stop), n, on_trial, progress)
             if opened is not None:
-                search.forget_changed(code_digests(*code, is_named=True))
+                search.forget_changed(search_digests(runner.cg, metric, {}, is_named=True))
     result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
     if result.trials and not was_stopped and len(result.failures) == len(result):
         first = result.trials[0]
         text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
         raise ScaleError(f"{text} Its values: {first.setting}.")
     return result
+
+
+def _searched_data(
+    axes: Sequence[Axis], hyperparameters: Mapping[str, Any], objective: _Objective, items: Sequence[Item]
+) -> dict[str, Callable[[], Any]]:
+    """Return the data that decide about a trial, by what they are, for their digests."""
+    choices = {axis.token: getattr(axis, "choices", None) for axis in axes}
+    fixed = {token: value for token, value in hyperparameters.items() if token not in choices}
+    return {
+        "hyperparameters": lambda: (fixed, choices),
+        "inputs of the cases": lambda: [(item.name, payload_digest(item.payload)) for item in items],
+        "labels of the cases": lambda: [
+            (case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases
+        ],
+        "tokens that are measured": lambda: objective.keep,
+    }
 
 
 def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:

@@ -13,7 +13,6 @@ import re
 import socket
 import tempfile
 import threading
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
@@ -65,15 +64,13 @@ class PackagedGraph:
 
 
 # The packages that this process has made, by what they compute; the oldest ones go.
-_PACKAGES: Final[OrderedDict[tuple[str, ...], PackagedGraph]] = OrderedDict()
-_LOCK: Final = threading.Lock()
+_PACKAGES: Final[dict[tuple[str, ...], PackagedGraph]] = {}
 
 
 def known_package(runner: CompGraphRunner) -> PackagedGraph | None:
     """Return the package of a runner's graph if this process has made it before."""
     key = _key_of(runner)
-    with _LOCK:
-        return None if key is None else _PACKAGES.get(key)
+    return None if key is None else _PACKAGES.get(key)
 
 
 def package_of(runner: CompGraphRunner) -> PackagedGraph:
@@ -99,10 +96,8 @@ def package_of(runner: CompGraphRunner) -> PackagedGraph:
     digest = combined_digest(*(part for file in files.items() for part in file)).hex()
     package = PackagedGraph(digest, files, files.get("requirements.txt", b"").decode())
     if (key := _key_of(runner)) is not None:
-        with _LOCK:
-            _PACKAGES[key] = package
-            while len(_PACKAGES) > _MOST_PACKAGES:
-                _PACKAGES.popitem(last=False)
+        _PACKAGES[key] = package
+        _drop_oldest(_PACKAGES, _MOST_PACKAGES)
     return package
 
 
@@ -117,6 +112,11 @@ def _reasons(reasons: Sequence[str], folder: Path) -> list[str]:
         for name in missing
     ]
     return [*first, *texts]
+
+
+def _drop_oldest(kept: dict[Any, Any], most: int) -> None:
+    for key in list(kept)[:-most]:
+        kept.pop(key, None)
 
 
 def _key_of(runner: CompGraphRunner) -> tuple[str, ...] | None:
@@ -251,7 +251,7 @@ class PackagedJob:
 
 
 # By package and options: the members of the bundle's enumerations, and a runner that each job branches from.
-_LOADED: Final[OrderedDict[tuple[str, int, bool, bool], tuple[Mapping[str, Any], CompGraphRunner]]] = OrderedDict()
+_LOADED: Final[dict[tuple[str, int, bool, bool], tuple[Mapping[str, Any], CompGraphRunner]]] = {}
 _LOAD_LOCK: Final = threading.Lock()
 
 
@@ -276,8 +276,7 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
                 _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **options)
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
                 return _load_error(packaged.package, error)
-            while len(_LOADED) > _MOST_LOADED:
-                _LOADED.popitem(last=False)
+            _drop_oldest(_LOADED, _MOST_LOADED)
         enums, runner = _LOADED[key]
     own = branched(runner)
     own.set(**unpacked_values(packaged.hyperparameters, enums))
