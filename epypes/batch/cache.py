@@ -8,7 +8,7 @@ and the state of the lists, arrays and objects that functions use. What can't be
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -209,7 +209,7 @@ def outcome_cache(
     *,
     keep: Sequence[str] = (),
     show: Sequence[str] | None = (),
-    varied: Collection[str] = (),
+    settings: Sequence[Mapping[str, Any]],
 ) -> Iterator[OutcomeCache | None]:
     """Open the series of a runner's outcomes; what waits to be written is written at the end.
 
@@ -227,8 +227,8 @@ def outcome_cache(
         Tokens whose whole values are wanted. They are not in the store, so with one everything is run.
     show
         Tokens of which thumbnails are made.
-    varied
-        The hyperparameters of which each outcome has its own values.
+    settings
+        The hyperparameters of which each outcome has its own values, by token.
 
     Warns
     -----
@@ -246,12 +246,16 @@ def outcome_cache(
             yield None
             return
         found = graph_fingerprint(runner.cg)
-        series = _series_of(opened, kind, runner, name, varied, found)
+        fixed = {token: value for token, value in runner.hyperparameters.items() if token not in settings[0]}
+        about = {"graph": found.code, "hyperparameters": _hyperparameter_labels(fixed)}
+        own_name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
+        series = opened.series(kind, name or own_name, about=about)
+        _check_same(series, about)
         doubt = _doubt(found, has_name=bool(name))
         if doubt:
             warn(doubt, stacklevel=5)
         shown = "" if show == () else f"show={show and list(show)}"
-        with OutcomeCache(series, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
+        with OutcomeCache(series, settings, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
             yield cache
 
 
@@ -264,17 +268,6 @@ def _doubt(found: Fingerprint, *, has_name: bool) -> str:
         text = f"The graph uses {reader_text(found.reader)}, which may have changed: every item is run again."
         return f"{text} To reuse what is stored, give name=, and another name once such a file or variable has changed."
     return ""
-
-
-def _series_of(
-    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str], found: Fingerprint
-) -> Series:
-    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
-    about = {"graph": found.code, "hyperparameters": _hyperparameter_labels(fixed)}
-    own_name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
-    series = store.series(kind, name or own_name, about=about)
-    _check_same(series, about)
-    return series
 
 
 def _hyperparameter_labels(values: Mapping[str, Any]) -> dict[str, str]:
@@ -301,6 +294,14 @@ def _check_same(series: Series, about: Mapping[str, Any]) -> None:
     )
 
 
+def _setting_label(setting: Mapping[str, Any]) -> str:
+    """Return the values of a setting as a part of a key; "" if one has no digest."""
+    try:
+        return repr({token: value_label(value) for token, value in setting.items()})
+    except NoDigest:
+        return ""
+
+
 class OutcomeCache:
     """The outcomes of a series; new ones are written a few at a time.
 
@@ -308,6 +309,8 @@ class OutcomeCache:
     ----------
     series
         The series.
+    settings
+        With which items are run.
     suffix
         What else than the item and its setting decides about an outcome.
     reads
@@ -318,42 +321,30 @@ class OutcomeCache:
     An item whose content can't be digested is run each time, and not written.
     """
 
-    def __init__(self, series: Series, suffix: str = "", *, reads: bool = True) -> None:
-        self._series, self._suffix = series, suffix
+    def __init__(
+        self, series: Series, settings: Sequence[Mapping[str, Any]], suffix: str = "", *, reads: bool = True
+    ) -> None:
+        self._series, self._settings, self._suffix = series, settings, suffix
         self._known = series.keys() if reads else frozenset()
+        self._labels = [_setting_label(setting) for setting in settings]
         self._keys: dict[tuple[int, int], str] = {}
-        # With the settings themselves, so that no other has the identity of one.
-        self._setting_labels: dict[int, tuple[Mapping[str, Any], str | None]] = {}
         self._waiting: list[tuple[str, dict[str, Any]]] = []
         self._written_s = monotonic()
 
-    def found(self, item: Item, settings: Iterable[Mapping[str, Any]]) -> list[Outcome | None]:
-        """Return the stored outcomes of an item under settings; None for those that have to be run."""
+    def found(self, item: Item) -> list[Outcome | None]:
+        """Return the stored outcomes of an item, by setting; None for those that have to be run."""
         try:
-            label = f"{item.name} {payload_digest(item.payload)} {self._suffix}"
+            of_item = f"{item.name} {payload_digest(item.payload)} {self._suffix}"
         except NoDigest:
-            return [None for _ in settings]
-        return [self._outcome(item, setting, label) for setting in settings]
-
-    def _outcome(self, item: Item, setting: Mapping[str, Any], of_item: str) -> Outcome | None:
-        of_setting = self._label_of_setting(setting)
-        if of_setting is None:
-            return None
-        key = f"{of_item} {of_setting}"
-        stored = self._series.get(key) if key in self._known else None
-        if stored is None:
-            self._keys[item.number, id(setting)] = key
-            return None
-        return Outcome.from_json(stored, item, setting)
-
-    def _label_of_setting(self, setting: Mapping[str, Any]) -> str | None:
-        if id(setting) not in self._setting_labels:
-            try:
-                label = repr({token: value_label(value) for token, value in setting.items()})
-            except NoDigest:
-                label = None
-            self._setting_labels[id(setting)] = setting, label
-        return self._setting_labels[id(setting)][1]
+            return [None for _ in self._settings]
+        outcomes: list[Outcome | None] = []
+        for setting, label in zip(self._settings, self._labels, strict=True):
+            key = f"{of_item} {label}"
+            stored = self._series.get(key) if label and key in self._known else None
+            outcomes.append(None if stored is None else Outcome.from_json(stored, item, setting))
+            if label and stored is None:
+                self._keys[item.number, id(setting)] = key
+        return outcomes
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes of items that had to be run."""

@@ -141,10 +141,6 @@ class ChoiceAxis:
     choices: tuple[Any, ...]
     labels: tuple[str, ...]
 
-    def values(self) -> Sequence[Any]:
-        """Return all values."""
-        return self.choices
-
     def at(self, share: float) -> Any:
         """Return the value at a share from 0 to below 1."""
         return self.choices[int(share * len(self.choices))]
@@ -189,16 +185,17 @@ def axis_of(runner: CompGraphRunner, token: str, param: Param) -> Axis:
     ------
     ScaleError
         An end is open, or there is no such number.
-    UnknownName
-        A choice is no branch of a switch that the token selects.
     """
     if param.choices is not None:
-        _require_branches(runner, token, param.choices)
         names = (one.name if isinstance(one, enum.Enum) else f"{one!r:.80}" for one in param.choices)
         labels = tuple(param.labels or names)
         if len(set(labels)) < len(labels):  # texts that are alike are numbered
             labels = tuple(f"{text} #{number}" for number, text in enumerate(labels))
         return ChoiceAxis(token, param.choices, labels)
+    return _number_axis(runner, token, param)
+
+
+def _number_axis(runner: CompGraphRunner, token: str, param: Param) -> NumberAxis:
     low: Any
     high: Any
     low, high = param.soft or (param.low, param.high)
@@ -303,6 +300,7 @@ def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
         raise ScaleError(
             f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values. Write {name}=[...]."
         )
+    _require_branches(runner, name, param.choices or ())
     return param
 
 
@@ -450,6 +448,7 @@ def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
 
 def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Grid:
     """Return the grid of each value with each other, or of the first values of all, the second ones, and so on."""
+    values: dict[str, Sequence[Any]] = {}
     for name, of_name in given.items():
         if isinstance(of_name, tuple):
             listed = f"[{', '.join(map(repr, of_name[:4]))}{', ...' * (len(of_name) > 4)}]"
@@ -457,7 +456,8 @@ def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Gr
                 f"{name}={of_name!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
                 f"for values between two ends how='random' with n=..."
             )
-    values = {name: axis_of(runner, name, _param(runner, name, of_name)).values() for name, of_name in given.items()}
+        param = _param(runner, name, of_name)
+        values[name] = param.choices or _number_axis(runner, name, param).values()
     lengths = {name: len(of_name) for name, of_name in values.items()}
     if how == "zip" and len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())

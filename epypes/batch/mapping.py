@@ -168,7 +168,7 @@ def run_items(
     count = count_of(images)
     outcomes: list[Outcome] = []
     with (
-        outcome_cache(store, kind, runner, name, keep=kept, show=shown, varied=settings[0]) as cache,
+        outcome_cache(store, kind, runner, name, keep=kept, show=shown, settings=in_order) as cache,
         progress_bar(progress, count and count * len(settings), kind, unit=_UNITS[kind]) as advance,
     ):
 
@@ -184,7 +184,7 @@ def run_items(
                     raise too_many_outcomes(len(settings), settings[0], item.number + 1)
                 missing = in_order
                 if cache is not None:
-                    stored = cache.found(item, in_order)
+                    stored = cache.found(item)
                     take([outcome for outcome in stored if outcome is not None])
                     missing = tuple(one for one, outcome in zip(in_order, stored, strict=True) if outcome is None)
                 parts = _parts(runner, missing, executor, count)

@@ -109,7 +109,8 @@ class Outcome:
         }
         return {
             **{part.name: getattr(self, part.name) for part in fields(self) if part.name != "kept"},
-            "setting": {token: _json_value(value) for token, value in self.setting.items()},
+            "setting": {token: short_value(value) for token, value in self.setting.items()},
+            "times_ns": dict(self.times_ns),
             "error_info": None if self.error_info is None else asdict(self.error_info),
             "thumbnails": thumbnails,
         }
@@ -156,7 +157,7 @@ class OutcomeSequence(Sequence[Outcome]):
 
 def short_value(value: Any) -> Any:
     """Return a number, text or truth value as it is, and of anything else a short text."""
-    value = scalar(value)
+    value = _scalar(value)
     if value is None or type(value) in (bool, int, float, str):
         return value
     return str(value) if isinstance(value, str) else short_text(value)
@@ -167,15 +168,7 @@ def short_text(value: Any) -> str:
     return sketch(value, Look()).shown.text
 
 
-def _json_value(value: Any) -> Any:
-    """Return a value of a setting as JSON; it is not read back."""
-    value = scalar(value)
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return [_json_value(item) for item in value] if isinstance(value, tuple | list) else str(value)
-
-
-def scalar(value: Any) -> Any:
+def _scalar(value: Any) -> Any:
     """Return a number or truth value of numpy as Python's, and a very long number as text; anything else as it is."""
     if isinstance(value, int) and value.bit_length() > _MOST_BITS:
         return f"int of {value.bit_length():,} bits"
