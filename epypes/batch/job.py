@@ -79,7 +79,7 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
         return None
 
     try:
-        own = start.branch(begin)
+        own = begin() if job.start is None else start.branch(begin)
         yield from begun
         if own is not None:
             for setting in waiting:
