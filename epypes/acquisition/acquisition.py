@@ -1,25 +1,53 @@
-"""Several cameras at once, and their frames nearest to a time."""
+"""Several cameras at once, each read by a thread of its own, and their frames nearest to a time."""
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import logging
 import threading
 import time
 import warnings
 import weakref
-from collections.abc import Callable, Sequence
-from types import TracebackType
-from typing import Any, Self
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Self
 
-from epypes.acquisition.cameras import camera, has_twins
-from epypes.acquisition.frames import Frame, Ring
-from epypes.acquisition.worker import CameraWorker, Counts, Ending, State
-from epypes.errors import StillRunning
+from epypes.acquisition.cameras import Camera, camera, has_twins
+from epypes.acquisition.frames import Frame, Ring, frame_image
+from epypes.errors import CameraUnavailable, StillRunning
 
-_AT_EXIT_S = 0.5
+State = Literal["stopped", "running", "ended", "failed"]
 
-_started: weakref.WeakSet[CameraWorker] = weakref.WeakSet()
+# A camera that gives nothing is asked again after 10, 20, 40 ms ..., at last every second.
+_FIRST_RETRY_S: Final = 0.01
+_LAST_RETRY_S: Final = 1.0
+# One missed frame is not reported; this many in a row are.
+_MISSES_REPORTED: Final = 5
+# close() may come in the moment before a read begins, which opens the camera again; so it is repeated.
+_CLOSE_AGAIN_S: Final = 0.05
+_AT_EXIT_S: Final = 0.5
+
+_log = logging.getLogger("epypes.acquisition")
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Frames, missed reads and failures of one camera since it was given to an ImageAcquisition.
+
+    Attributes
+    ----------
+    frames
+        Frames that came.
+    missed
+        Reads that gave no frame, and were tried again.
+    failed
+        How often it ended with an exception.
+    """
+
+    frames: int
+    missed: int
+    failed: int
 
 
 class ImageAcquisition:
@@ -79,15 +107,10 @@ class ImageAcquisition:
             raise ValueError(f"max_age_s must be above 0, or math.inf, not {max_age_s!r:.40}.")
         self.max_age_s = max_age_s
         self._lock = threading.Lock()
-        self._changed = changed = threading.Condition()
-
-        def on_change() -> None:
-            with changed:
-                changed.notify_all()
-
+        self._changed = threading.Condition()
         # The workers don't know this object, so that it can be collected while they run, and warn.
         self._workers = tuple(
-            CameraWorker(index, made, size, on_error, on_change) for index, made in enumerate(map(camera, cameras))
+            _CameraWorker(index, made, size, on_error, self._changed) for index, made in enumerate(map(camera, cameras))
         )
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
@@ -124,7 +147,7 @@ class ImageAcquisition:
                 _require_ended([worker.name for worker in self._workers if worker.is_alive], 0.0)
                 for worker in self._workers:
                     worker.start()
-                    _started.add(worker)
+                _started.update(self._workers)
                 self._finalizer = weakref.finalize(self, _abandon, self._workers)
         return self
 
@@ -143,8 +166,8 @@ class ImageAcquisition:
             if self._finalizer is not None:
                 self._finalizer.detach()
                 self._finalizer = None
-            endings = _end(self._workers, deadline_s)
-        _require_ended([ending.name for ending in endings if not ending.join(deadline_s)], timeout_s)
+            endings = [(worker.name, worker.stop(deadline_s)) for worker in self._workers]
+        _require_ended(_still_running(endings, deadline_s), timeout_s)
 
     def nearest(self, time_ns: int) -> tuple[Frame, ...]:
         """Return each camera's frame nearest to a time; never waits.
@@ -167,15 +190,13 @@ class ImageAcquisition:
         False at once if one of them has ended or failed without any.
         """
         with self._changed:
-            self._changed.wait_for(lambda: all(map(_is_settled, self._workers)), timeout_s)
+            self._changed.wait_for(lambda: all(worker.is_settled for worker in self._workers), timeout_s)
             return all(worker.has_frame for worker in self._workers)
 
     def __enter__(self) -> Self:
         return self.start()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def __repr__(self) -> str:
@@ -184,8 +205,151 @@ class ImageAcquisition:
         return f"<ImageAcquisition {state}: {len(self._workers)} cameras, {frames} frames>"
 
 
-def _is_settled(worker: CameraWorker) -> bool:
-    return worker.has_frame or worker.state in ("ended", "failed")
+class _CameraWorker:
+    """One camera, its ring, and its thread, which waits for the camera alone.
+
+    Parameters
+    ----------
+    index
+        Of the camera.
+    camera
+        Is read on the thread.
+    size
+        Of the ring.
+    on_error
+        Called on the thread with the index and the exception.
+    changed
+        Notified of the first frame and of the end.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        camera: Camera,
+        size: int,
+        on_error: Callable[[int, BaseException], object] | None,
+        changed: threading.Condition,
+    ) -> None:
+        self.name = f"camera {index}"
+        self.ring = Ring(size, name=f"Camera {index}")
+        self.state: State = "stopped"
+        self.has_frame = False
+        # Set by a finalizer, which must not wait for the lock of an Event: the thread that holds it may have called it.
+        self.is_abandoned = False
+        self._index, self._camera = index, camera
+        self._on_error, self._changed = on_error, changed
+        self._frames = self._missed = self._failed = self._missed_in_a_row = 0
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def counts(self) -> Counts:
+        return Counts(self._frames, self._missed, self._failed)
+
+    @property
+    def is_settled(self) -> bool:
+        return self.has_frame or self.state in ("ended", "failed")
+
+    @property
+    def is_alive(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread, of which there must be none."""
+        self._stop.clear()
+        self.has_frame, self.state, self._missed_in_a_row = False, "running", 0
+        self._thread = threading.Thread(target=self._run, name=f"epypes {self.name}", daemon=True)
+        self._thread.start()
+
+    def stop(self, deadline_s: float) -> list[threading.Thread]:
+        """Have the thread end after the read under way; return the threads to wait for, that of the camera first."""
+        self._stop.set()
+        thread = self._thread
+        if thread is None or not thread.is_alive():
+            return []
+        # On a thread of its own, since a user's close() might wait for a lock that the read holds.
+        closing = threading.Thread(
+            target=self._close_again, args=(thread, deadline_s), name=f"epypes close {self.name}", daemon=True
+        )
+        closing.start()
+        return [thread, closing]
+
+    def _close_again(self, thread: threading.Thread, deadline_s: float) -> None:
+        while thread.is_alive():
+            self._close()
+            thread.join(_CLOSE_AGAIN_S)
+            if time.monotonic() >= deadline_s:
+                return
+
+    def _run(self) -> None:
+        state: State = "ended"
+        failure = None
+        try:
+            self._capture()
+        except BaseException as exception:  # a generator's SystemExit must not end the thread in silence
+            state, failure = "failed", exception
+        # A read that was ended by close() may return or raise anything: that is no failure.
+        if self._is_stopping():
+            state, failure = "stopped", None
+        self._failed += failure is not None
+        self.state = state
+        self._notify()
+        if failure is not None:
+            self._report(failure)
+        self._close()
+
+    def _is_stopping(self) -> bool:
+        return self.is_abandoned or self._stop.is_set()
+
+    def _capture(self) -> None:
+        """Read frames until the camera is stopped, or has no more."""
+        while not self._is_stopping():
+            try:
+                given = [self._camera.read()]
+            except CameraUnavailable as error:
+                self._stop.wait(self._miss(error))
+                continue
+            captured_ns = time.time_ns()
+            if given[0] is None:
+                return
+            self._missed_in_a_row = 0
+            frame = Frame(frame_image(given), captured_ns, self._frames + 1)
+            # Counted before, so that a caller that has a frame finds it counted.
+            self._frames += 1
+            self.ring.append(frame)
+            if not self.has_frame:
+                self.has_frame = True
+                self._notify()
+
+    def _notify(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _miss(self, error: CameraUnavailable) -> float:
+        """Count a read that gave no frame; return after how many seconds to try again."""
+        self._missed += 1
+        self._missed_in_a_row += 1
+        if self._missed_in_a_row == _MISSES_REPORTED:
+            self._report(error)
+        return float(min(_LAST_RETRY_S, _FIRST_RETRY_S * 2 ** min(self._missed_in_a_row - 1, 10)))
+
+    def _close(self) -> None:
+        try:
+            self._camera.close()
+        except BaseException as exception:
+            self._report(exception)
+
+    def _report(self, exception: BaseException) -> None:
+        if self._on_error is None:
+            _log.error("%s: %s", self.name, exception, exc_info=exception)
+            return
+        try:
+            self._on_error(self._index, exception)
+        except BaseException:
+            _log.exception("%s: on_error itself failed", self.name)
+
+
+_started: weakref.WeakSet[_CameraWorker] = weakref.WeakSet()
 
 
 def _require_ended(busy: Sequence[str], timeout_s: float) -> None:
@@ -193,16 +357,23 @@ def _require_ended(busy: Sequence[str], timeout_s: float) -> None:
         raise StillRunning("ImageAcquisition", busy, timeout_s)
 
 
-def _end(workers: Sequence[CameraWorker], deadline_s: float) -> list[Ending]:
-    for worker in workers:
-        worker.ask_to_stop()
-    return [ending for worker in workers if (ending := worker.end_read(deadline_s)) is not None]
+def _still_running(endings: Iterable[tuple[str, Sequence[threading.Thread]]], deadline_s: float) -> list[str]:
+    """Wait for the threads of cameras that were stopped; return the names of those whose first one has not ended."""
+    busy = []
+    for name, threads in endings:
+        if threading.current_thread() in threads:
+            continue
+        for thread in threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
+        if threads and threads[0].is_alive():
+            busy.append(name)
+    return busy
 
 
-def _abandon(workers: Sequence[CameraWorker]) -> None:
+def _abandon(workers: Sequence[_CameraWorker]) -> None:
     # By the garbage collector or at exit: so no waiting, no locks.
     for worker in workers:
-        worker.ask_to_stop()
+        worker.is_abandoned = True
     text = f"An ImageAcquisition of {len(workers)} was left running. Call stop(), or use it in a with statement."
     warnings.warn(text, ResourceWarning, stacklevel=2)
 
@@ -214,5 +385,4 @@ def _end_threads() -> None:
     deadline_s = time.monotonic() + _AT_EXIT_S
     # Some interpreters start no thread any more by now.
     with contextlib.suppress(RuntimeError):
-        for ending in _end(list(_started), deadline_s):
-            ending.join(deadline_s)
+        _still_running([(worker.name, worker.stop(deadline_s)) for worker in list(_started)], deadline_s)

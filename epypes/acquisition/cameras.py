@@ -1,21 +1,44 @@
-"""Cameras made of paths, arrays, devices, iterables and functions."""
+"""Cameras made of paths, arrays, devices, iterables and functions, and their frames per second."""
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable, Iterable, Iterator
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Final
+from time import monotonic
+from typing import Any, Final, Protocol, runtime_checkable
 
-from epypes.acquisition.files import image_files, quiet_opencv, read_image
-from epypes.acquisition.frames import lasting_copy
-from epypes.acquisition.pace import USUAL_FPS, Camera, paced, require_fps
+from epypes.acquisition.files import image_files, is_image_file, read_image
+from epypes.acquisition.frames import frame_image
 from epypes.errors import ImageFileError
 from epypes.optional import optional_import
 from epypes.run.guard import is_array
 
 # OpenCV takes the number of a device as a C int.
 LAST_DEVICE: Final = 2**31 - 1
+# Of sources that would give frames as fast as a processor can.
+USUAL_FPS: Final = 10.0
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """A source of frames, one after the other: any object with these two methods."""
+
+    def read(self) -> Any:
+        """Return the next frame, (y, x) or (y, x, channels), when there is one; None: there are no more.
+
+        Called on the camera's own thread. It may fill one buffer again and again: a frame is copied where other
+        code could write to it. ``errors.CameraUnavailable`` means: no frame just now, try again later. Any other
+        exception ends this camera.
+        """
+
+    def close(self) -> None:
+        """Let go of what was opened, and end a `read` under way if that is possible.
+
+        Called from any thread, as often as it takes; `read` may be called again afterwards, and goes on.
+        """
 
 
 def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camera:
@@ -53,95 +76,22 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camer
     >>> left.read().shape
     (4, 6)
     """
-    if fps is not None:
-        fps = require_fps(fps)
-    if isinstance(source, str | Path):
-        return _of_text(source, fps, loop)
-    if isinstance(source, Integral) and not isinstance(source, bool):
-        return _of_number(int(source), fps)
-    if is_array(source):
-        return paced(StillCamera(source, loop), fps or USUAL_FPS)
-    if _is_capture(source):
-        return _of_capture(source, None, fps, loop)
-    if _has_methods(source, "read", "close"):
-        return paced(source, fps)
-    return _of_many(source, fps, loop)
-
-
-def has_twins(sources: Iterable[Any]) -> bool:
-    """Whether a source that can be read by one thread only is there twice."""
-    single = [
-        id(source)
-        for source in sources
-        if _is_capture(source) or _has_methods(source, "read", "close") or isinstance(source, Iterator)
-    ]
-    return len(set(single)) < len(single)
-
-
-def _of_text(source: str | Path, fps: float | None, loop: bool) -> Camera:
-    with optional_import():
-        from epypes.acquisition.captures import device_camera, video_camera
+    if fps is not None and (isinstance(fps, bool) or not isinstance(fps, Real) or not fps > 0):
+        raise ValueError(f"fps must be a number above 0, or None for the source's own pace, not {fps!r:.40}.")
     if isinstance(source, str) and "://" in source:
-        return device_camera(source, fps)
-    path = Path(source)
-    try:
-        is_device, is_folder = path.is_char_device(), path.is_dir()
-    except OSError as error:  # of a name that is too long
-        text = f"Image '{source!s:.80}' can't be read: {error.strerror}. Check the path."
-        raise ImageFileError(str(path), text) from error
-    if is_device:
-        return device_camera(str(path), fps)
-    if is_folder:
-        return paced(_folder_camera(path, loop), fps or USUAL_FPS)
-    if not path.is_file() or _is_image(path):
-        return paced(StillCamera(read_image(path), loop), fps or USUAL_FPS)
-    return video_camera(path, fps, loop)
-
-
-def _is_image(path: Path) -> bool:
-    """Whether a file has the first bytes of an image, or is named as one, which would open as an empty film.
-
-    It is not read as an image: that would load a film into the memory.
-    """
-    with optional_import():
-        import cv2
-    with quiet_opencv():
-        return bool(cv2.haveImageReader(str(path)) or (path.suffix and cv2.haveImageWriter(str(path))))
-
-
-def _folder_camera(path: Path, loop: bool) -> SequenceCamera:
-    """Return a camera that reads the images of a folder, by name; a file with an image's ending that is none is named.
-
-    Hidden files, folders and files without the ending of an image are left out.
-    """
-    with optional_import():
-        import cv2
-    files = image_files(path)
-    if not files:
-        raise ImageFileError(str(path), f"There are no images in folder {str(path)!r}. Put PNG, JPEG or TIFF into it.")
-    with quiet_opencv():
-        broken = [file for file in files if not cv2.haveImageReader(str(file))]
-    if broken:
-        read_image(broken[0])  # which says more, if it fails too
-        raise ImageFileError(str(broken[0]), f"{str(broken[0])!r} is not an image that OpenCV can read. Take it out.")
-    return SequenceCamera(lambda: map(read_image, files), loop)
-
-
-def _of_number(number: int, fps: float | None) -> Camera:
-    with optional_import():
-        from epypes.acquisition.captures import device_camera
-    if not 0 <= number <= LAST_DEVICE:
-        raise ValueError(f"No camera has the number {number}. They go from 0 to {LAST_DEVICE}.")
-    return device_camera(number, fps)
-
-
-def _of_capture(capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool) -> Camera:
-    with optional_import():
-        from epypes.acquisition.captures import capture_camera
-    return capture_camera(capture, opening, fps, loop)
-
-
-def _of_many(source: Any, fps: float | None, loop: bool) -> Camera:
+        return _of_capture(source, fps, loop)
+    if isinstance(source, str | Path):
+        return _of_path(Path(source), fps, loop)
+    if isinstance(source, Integral) and not isinstance(source, bool):
+        if not 0 <= int(source) <= LAST_DEVICE:
+            raise ValueError(f"No camera has the number {source}. They go from 0 to {LAST_DEVICE}.")
+        return _of_capture(int(source), fps, loop)
+    if is_array(source):
+        return _still_camera(source, fps, loop)
+    if _is_capture(source):
+        return _of_capture(source, fps, loop)
+    if _is_camera(source):
+        return paced(source, fps)
     if isinstance(source, Iterator):
         return paced(SequenceCamera(lambda: source, loop=False), fps)
     if isinstance(source, Iterable) and not isinstance(source, bytes | bytearray | memoryview | dict | set | frozenset):
@@ -154,10 +104,48 @@ def _of_many(source: Any, fps: float | None, loop: bool) -> Camera:
     )
 
 
+def has_twins(sources: Iterable[Any]) -> bool:
+    """Whether a source that can be read by one thread only is there twice."""
+    single = [
+        id(source) for source in sources if _is_capture(source) or _is_camera(source) or isinstance(source, Iterator)
+    ]
+    return len(set(single)) < len(single)
+
+
+def _of_capture(source: Any, fps: float | None, loop: bool, opening: Callable[[], Any] | None = None) -> Camera:
+    with optional_import():
+        from epypes.acquisition.captures import capture_camera
+    return capture_camera(source, fps, loop, opening)
+
+
+def _of_path(path: Path, fps: float | None, loop: bool) -> Camera:
+    try:
+        is_device, is_folder = path.is_char_device(), path.is_dir()
+    except OSError as error:  # of a name that is too long
+        text = f"Image '{path!s:.80}' can't be read: {error.strerror}. Check the path."
+        raise ImageFileError(str(path), text) from error
+    if is_device:
+        return _of_capture(str(path), fps, loop)
+    if is_folder:
+        files = image_files(path)
+        if not files:
+            text = f"There are no images in folder {str(path)!r}. Put PNG, JPEG or TIFF into it."
+            raise ImageFileError(str(path), text)
+        return paced(SequenceCamera(lambda: map(read_image, files), loop), fps or USUAL_FPS)
+    if not path.is_file() or is_image_file(path):
+        return _still_camera(read_image(path), fps, loop)
+    return _of_capture(path, fps, loop)
+
+
+def _still_camera(image: Any, fps: float | None, loop: bool) -> Camera:
+    frame = frame_image([image])
+    return paced(SequenceCamera(lambda: (frame,), loop), fps or USUAL_FPS)
+
+
 def _of_function(source: Callable[[], Any], fps: float | None, loop: bool) -> Camera:
     made = source()
     if _is_capture(made):
-        return _of_capture(made, source, fps, loop)
+        return _of_capture(made, fps, loop, source)
     if not isinstance(made, Iterable) or is_array(made):
         name = getattr(source, "__qualname__", "The function")
         raise TypeError(
@@ -172,41 +160,12 @@ def _is_capture(source: Any) -> bool:
     return _has_methods(source, "grab", "retrieve", "release")
 
 
+def _is_camera(source: Any) -> bool:
+    return _has_methods(source, "read", "close")
+
+
 def _has_methods(source: Any, *names: str) -> bool:
     return not isinstance(source, type) and all(callable(getattr(source, name, None)) for name in names)
-
-
-# -- images in files or in memory --------------------------------------------------------------------------------------
-
-
-class StillCamera:
-    """The same image again and again, or once.
-
-    Parameters
-    ----------
-    image
-        (y, x) or (y, x, channels); a copy is taken, and every frame is that copy.
-    loop
-        Whether it comes again after the first time.
-    """
-
-    def __init__(self, image: Any, loop: bool = True) -> None:
-        self._image = lasting_copy(image)
-        self._loop, self._was_given = loop, False
-
-    def read(self) -> Any:
-        """Return the image; None from the second time on, if it comes only once."""
-        if self._was_given and not self._loop:
-            return None
-        self._was_given = True
-        return self._image
-
-    def close(self) -> None:
-        """Begin anew."""
-        self._was_given = False
-
-    def __repr__(self) -> str:
-        return f"<StillCamera: {self._image.shape} {self._image.dtype}>"
 
 
 class SequenceCamera:
@@ -242,11 +201,52 @@ class SequenceCamera:
         """Begin anew with the next `read`; an iterator, which can't, goes on where it was."""
         self._items = None
 
-    def __repr__(self) -> str:
-        return f"<SequenceCamera of {getattr(self._start, '__qualname__', 'frames'):.60}>"
-
 
 def _required(item: Any) -> Any:
     if item is None:
         raise TypeError("The iterator gave None, which is no image. Let it end, or wait inside it for the next one.")
     return item
+
+
+# -- frames per second ------------------------------------------------------------------------------------------------
+
+
+class PacedCamera:
+    """A camera that gives its first frame at once, and each further one when it is due.
+
+    Parameters
+    ----------
+    camera
+        Gives the frames.
+    fps
+        Frames per second. If the reader comes late, the next frame is due one period later: nothing is caught up.
+    """
+
+    def __init__(self, camera: Camera, fps: float) -> None:
+        self._camera, self._period_s = camera, 1 / fps
+        self._due_s = -math.inf
+        self._closing = threading.Event()
+
+    def read(self) -> Any:
+        """Return the next frame when it is due; None if `close` was called meanwhile."""
+        self._closing.clear()
+        if self._closing.wait(min(self._due_s - monotonic(), threading.TIMEOUT_MAX)):
+            return None
+        self._due_s = next_due_s(self._due_s, self._period_s)
+        return self._camera.read()
+
+    def close(self) -> None:
+        """End the wait, and close the camera."""
+        self._closing.set()
+        self._camera.close()
+
+
+def paced(camera: Camera, fps: float | None) -> Camera:
+    """Return a camera that is kept to ``fps`` frames per second; the camera as it is for None and infinity."""
+    return camera if fps is None or fps == math.inf else PacedCamera(camera, float(fps))
+
+
+def next_due_s(due_s: float, period_s: float) -> float:
+    """Return when the frame after one that was due at ``due_s`` is due; a period from now, if that has passed."""
+    now_s = monotonic()
+    return due_s + period_s if now_s - due_s < period_s else now_s + period_s

@@ -86,16 +86,13 @@ def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr")
         kind = f"{image.dtype} {image.shape}"
         raise ImageFileError(str(path), f"An array of {kind} can't be written as an image. Use a file ending in .npy.")
     try:
-        done, data = cv2.imencode(Path(path).suffix, shown if order == "bgr" else _in_other_order(shown))
-        if not done:
-            raise ImageFileError(str(path), f"OpenCV could not encode {path}. Use .png.")
-        Path(path).write_bytes(data.tobytes())
+        _, data = cv2.imencode(Path(path).suffix, shown if order == "bgr" else _in_other_order(shown))
     except cv2.error as error:
         text = f"OpenCV can't write {str(path)!r}: no such format as {Path(path).suffix!r}. Use .png."
         raise ImageFileError(str(path), text) from error
+    try:
+        Path(path).write_bytes(data.tobytes())
     except OSError as error:
-        if isinstance(error, ImageFileError):
-            raise
         raise ImageFileError(str(path), f"{str(path)!r} can't be written: {error.strerror}.") from error
 
 
@@ -118,6 +115,18 @@ def image_files(path: Path) -> list[Path]:
         raise ImageFileError(str(path), f"Folder {str(path)!r} can't be read: {error.strerror}.") from error
 
 
+def is_image_file(path: Path) -> bool:
+    """Whether a file has the first bytes of an image, or is named as one, which would open as an empty film.
+
+    It is not read as an image: that would load a film into the memory.
+    """
+    with optional_import("vision"):
+        import cv2
+
+    with quiet_opencv():
+        return bool(cv2.haveImageReader(str(path)) or (path.suffix and cv2.haveImageWriter(str(path))))
+
+
 def natural_order(file: Path) -> tuple[list[str | int], str]:
     """Return the key that sorts files so that ``img2`` comes before ``img10``."""
     # Texts and numbers alternate, so texts are compared with texts, and numbers with numbers.
@@ -132,24 +141,19 @@ def quiet_opencv() -> Iterator[None]:
     The level belongs to the whole process and cameras read side by side, so the last block to end sets it back.
     """
     global _quiet_blocks, _level_before
+    with optional_import():
+        import cv2
+
+    # Up to OpenCV 4.12 the function is in cv2 itself. It returns the level before.
+    set_level = getattr(cv2.utils, "logging", cv2).setLogLevel
     with _quiet_lock:
-        if _quiet_blocks == 0:
-            _level_before = _set_log_level(_SILENT)
         _quiet_blocks += 1
+        if _quiet_blocks == 1:
+            _level_before = set_level(_SILENT)
     try:
         yield
     finally:
         with _quiet_lock:
             _quiet_blocks -= 1
             if _quiet_blocks == 0:
-                _set_log_level(_level_before)
-
-
-def _set_log_level(level: int) -> int:
-    """Set the level of OpenCV's log, and return the one before."""
-    with optional_import():
-        import cv2
-
-    # Up to OpenCV 4.12 the function is in cv2 itself.
-    logging = getattr(cv2.utils, "logging", cv2)
-    return int(logging.setLogLevel(level))
+                set_level(_level_before)

@@ -1,16 +1,14 @@
 """The values that parameters of OpenCV's and scikit-image's functions take.
 
-- ``table``: the entries by function and parameter, read from ``opencv.toml`` and ``skimage.toml`` on first use
-- ``lookup``: the entry of a function's parameter, found by object; the usual values of a parameter's name
+- ``lookup``: the table in ``opencv.toml`` and ``skimage.toml``, looked up by function, as an object, and by name
 - ``calls``: the entries of the library functions that a user's function passes its parameter to
 - ``ranges``: the range of a hyperparameter of a graph
 
 Nothing here imports these libraries: a caller that uses their functions has imported them.
 """
 
-from epypes.catalog.calls import Use, parameter_names, uses
-from epypes.catalog.lookup import entry_of, usual
+from epypes.catalog.calls import parameter_names, uses
+from epypes.catalog.lookup import CatalogEntry, entry_of, fits, table, usual
 from epypes.catalog.ranges import plain, range_of
-from epypes.catalog.table import CatalogEntry, table
 
-__all__ = ["CatalogEntry", "Use", "entry_of", "parameter_names", "plain", "range_of", "table", "uses", "usual"]
+__all__ = ["CatalogEntry", "entry_of", "fits", "parameter_names", "plain", "range_of", "table", "uses", "usual"]

@@ -7,20 +7,17 @@ up by object, so it does not matter how it was imported.
 from __future__ import annotations
 
 import ast
-import builtins
 import inspect
 import linecache
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from types import FunctionType, ModuleType
 from typing import Any, Final
 
-from epypes.catalog.lookup import entry_of
-from epypes.catalog.table import CatalogEntry
+from epypes.catalog.lookup import CatalogEntry, entry_of
 from epypes.graph.redefined import unwrapped
 
 _CONVERSIONS: Final = ("int", "float", "round", "bool")
@@ -140,16 +137,12 @@ def _is_parameter(expression: ast.expr, parameter: str) -> bool:
 
 def _is_changed(node: _Definition, parameter: str) -> bool:
     """Whether a function assigns another value to the parameter's name; ``k = int(k)`` is the same value."""
-    assigned = (part for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == parameter)
-    stores = sum(isinstance(part.ctx, ast.Store) for part in assigned)
-    conversions = sum(
-        isinstance(part, ast.Assign)
-        and _is_parameter(part.value, parameter)
-        and isinstance(part.targets[0], ast.Name)
-        and not isinstance(part.value, ast.Tuple | ast.List)
-        for part in ast.walk(node)
-    )
-    return stores > conversions
+    parts = [*ast.walk(node)]
+    conversions = [
+        part.targets[0] for part in parts if isinstance(part, ast.Assign) and _is_parameter(part.value, parameter)
+    ]
+    stores = (part for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
+    return any(store.id == parameter and store not in conversions for store in stores)
 
 
 def _definition(function: Any) -> _Definition | None:
@@ -186,10 +179,8 @@ def _argument_names(node: _Definition) -> tuple[str, ...]:
 
 def _names_of(function: FunctionType, node: _Definition) -> dict[str, Any]:
     """Return the objects of the names in a function: Python's own, its module's, enclosing ones, imported in it."""
-    names = {**vars(builtins), **function.__globals__}
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=False):
-        with suppress(ValueError):  # empty: the name has no value yet
-            names[name] = cell.cell_contents
+    known = inspect.getclosurevars(function)
+    names = {**known.builtins, **known.globals, **known.nonlocals}
     for part in ast.walk(node):
         if isinstance(part, ast.Import):
             for alias in part.names:

@@ -1,20 +1,95 @@
-"""Look-up of a parameter's usual values: by the very function that takes it, or by its name alone."""
+"""The parameters of library functions, looked up by the very function that takes them, or by name alone.
+
+The table is in TOML files of this package, which are read once, when they are first needed. ``opencv.toml`` explains
+the fields.
+"""
 
 from __future__ import annotations
 
 import re
 import sys
+import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import cache, partial, reduce
+from importlib.resources import files
+from numbers import Integral, Real
+from operator import or_
 from typing import Any, Final
 
-from epypes.catalog.table import FILES, CatalogEntry, entries_of, param_of, read_toml, table
 from epypes.hints import Param
 
+_FILES: Final = {"cv2": "opencv.toml", "skimage": "skimage.toml"}
 _CREATE: Final = "_create"
 # A shorter name of a parameter, as "n" or "dp", means too many things.
 _SHORTEST: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogEntry:
+    """The values of one parameter of a library's function.
+
+    Attributes
+    ----------
+    library
+        The package that has the function, as ``"cv2"``.
+    function
+        Its name in the package, as ``"filters.gaussian"``.
+    parameter
+        The parameter's name.
+    param
+        The range that the function takes, and as ``soft`` the usual one. Ends are floats where a whole number would be
+        no more usual than another.
+    constants
+        Names of the constants whose values are the choices. Which of them exist depends on the library's version.
+    cuts
+        The parameter of the image whose values are compared with this one; empty if none are.
+    """
+
+    library: str
+    function: str
+    parameter: str
+    param: Param
+    constants: tuple[str, ...] = ()
+    cuts: str = ""
+
+    def resolved(self) -> Param | None:
+        """Return the values, with the constants that the loaded library has; None if it has none of them."""
+        if not self.constants:
+            return self.param
+        library = sys.modules.get(self.library)
+        values = {name: [getattr(library, part, None) for part in name.split("|")] for name in self.constants}
+        existing = {name: reduce(or_, parts) for name, parts in values.items() if None not in parts}
+        if not existing:
+            return None
+        return replace(self.param, choices=tuple(existing.values()), labels=tuple(existing))
+
+
+@cache
+def table() -> tuple[CatalogEntry, ...]:
+    """Return all entries, OpenCV's first, in the files' order."""
+    found = []
+    for library, file in _FILES.items():
+        content = _read_toml(file)
+        shared = content.pop("shared")
+        for function, parameters in content.items():
+            for parameter, value in parameters.items():
+                fields = dict(shared[value] if isinstance(value, str) else value)
+                constants, cuts = tuple(fields.pop("constants", ())), fields.pop("cuts", "")
+                found.append(CatalogEntry(library, function, parameter, _param_of(fields), constants, cuts))
+    return tuple(found)
+
+
+def _read_toml(file: str) -> dict[str, Any]:
+    return tomllib.loads(files("epypes.catalog").joinpath(file).read_text("utf-8"))
+
+
+def _param_of(fields: Mapping[str, Any]) -> Param:
+    values: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
+    return Param(**values)
+
+
+# -- by function ------------------------------------------------------------------------------------------------------
 
 
 def entry_of(function: Any, parameter: str) -> CatalogEntry | None:
@@ -24,41 +99,25 @@ def entry_of(function: Any, parameter: str) -> CatalogEntry | None:
     """
     while isinstance(function, partial):
         function = function.func
-    name = getattr(function, "__qualname__", None) or getattr(function, "__name__", None)
-    if not isinstance(name, str):
-        return None
-    # OpenCV makes an object in three ways: cv2.ORB_create(), cv2.ORB.create(), cv2.BFMatcher().
-    last_names = (name, name.removesuffix(".create") + _CREATE)
-    for library in filter(sys.modules.__contains__, FILES):
-        functions = _by_function(library)
-        for last_name in last_names:
-            for full_name, parameters in functions.get(last_name, {}).items():
-                if _is_called(function, library, full_name):
-                    return parameters.get(parameter)
-    return None
+    entries = (entry for entry in table() if entry.parameter == parameter and callable(function))
+    return next((entry for entry in entries if _is_of(entry, function)), None)
 
 
-@cache
-def _by_function(library: str) -> Mapping[str, Mapping[str, Mapping[str, CatalogEntry]]]:
-    """Return the entries of a library by the function's last name, its full name, and the parameter."""
-    found: dict[str, dict[str, dict[str, CatalogEntry]]] = {}
-    for entry in entries_of(library):
-        functions = found.setdefault(entry.function.rpartition(".")[2], {})
-        functions.setdefault(entry.function, {})[entry.parameter] = entry
-    return found
-
-
-def _is_called(function: Any, library: str, full_name: str) -> bool:
-    """Whether a library has this very function under a name."""
-    path, _, last_name = full_name.rpartition(".")
-    module = sys.modules.get(f"{library}.{path}" if path else library)
-    if module is None or (path and not str(getattr(function, "__module__", "")).startswith(library)):
+def _is_of(entry: CatalogEntry, function: Any) -> bool:
+    """Whether an entry's library has this very function under the entry's name."""
+    path, _, name = entry.function.rpartition(".")
+    module = sys.modules.get(f"{entry.library}.{path}" if path else entry.library)
+    if module is None or (path and not str(getattr(function, "__module__", "")).startswith(entry.library)):
         return False  # without getattr on the module: scikit-image imports what its attributes name
-    names: list[tuple[object, str]] = [(module, last_name)]
-    if last_name.endswith(_CREATE):
-        class_name = last_name.removesuffix(_CREATE)
+    names: list[tuple[object, str]] = [(module, name)]
+    if name.endswith(_CREATE):
+        # OpenCV makes an object in three ways: cv2.ORB_create(), cv2.ORB.create(), cv2.BFMatcher().
+        class_name = name.removesuffix(_CREATE)
         names += [(getattr(module, class_name, None), "create"), (module, class_name)]
     return any(getattr(owner, name, None) is function for owner, name in names)
+
+
+# -- by name ----------------------------------------------------------------------------------------------------------
 
 
 def usual(name: str, value: float | str) -> Param | None:
@@ -83,10 +142,10 @@ def usual(name: str, value: float | str) -> Param | None:
 @cache
 def _by_name() -> tuple[Mapping[str, tuple[Param, ...]], Mapping[str, tuple[CatalogEntry, ...]]]:
     """Return the ranges of common names, and the entries by the parameter's name."""
-    content = read_toml("names.toml")
+    content = _read_toml("names.toml")
     common: dict[str, tuple[Param, ...]] = {}
     for group in content["usual"]:
-        common |= dict.fromkeys(group["names"], tuple(map(param_of, group["ranges"])))
+        common |= dict.fromkeys(group["names"], tuple(map(_param_of, group["ranges"])))
     by_parameter: dict[str, tuple[CatalogEntry, ...]] = {}
     for entry in table():
         name = entry.parameter.replace("_", "").lower()
@@ -112,7 +171,7 @@ def _agreed(entries: Iterable[CatalogEntry]) -> tuple[Param, ...]:
 
 def _first_fitting(params: Iterable[Param], value: Any) -> Param | None:
     """Return the first range whose usual values hold a value, or the last that allows it."""
-    fitting = [param for param in (_for_type_of(value, param) for param in params) if _allows(param, value)]
+    fitting = [param for param in (_for_type_of(value, param) for param in params) if fits(param, value)]
     return next((param for param in fitting if _is_usual(param, value)), fitting[-1] if fitting else None)
 
 
@@ -133,9 +192,9 @@ def _is_usual(param: Param, value: Any) -> bool:
     return bool(param.soft[0] <= value <= param.soft[1])
 
 
-def _allows(param: Param, value: Any) -> bool:
-    if param.choices is not None and isinstance(value, bool) != isinstance(param.choices[0], bool):
-        return False  # 1 equals True
-    if isinstance(value, str | bool) and param.choices is None:
-        return False
-    return param.allows(value) and (isinstance(value, int) or not param.odd)
+def fits(param: Param, value: Any) -> bool:
+    """Whether a range holds a value, which is of its type: 1 is not True, and only integers are odd."""
+    if param.choices is not None:
+        return isinstance(value, bool) == isinstance(param.choices[0], bool) and param.allows(value)
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    return is_number and param.allows(value) and (isinstance(value, Integral) or not param.odd)

@@ -6,14 +6,13 @@ or for its name. What is usual is a ``soft`` range and forbids nothing.
 
 from __future__ import annotations
 
-import numbers
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from epypes.catalog.calls import parameter_names, uses
-from epypes.catalog.lookup import entry_of, usual
+from epypes.catalog.lookup import entry_of, fits, usual
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi
 
@@ -30,12 +29,12 @@ def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:
     for hint in _hints(cg, token):
         # Values are any objects; one that can't be compared has no range.
         with suppress(Exception):
-            if _holds(hint, number):
+            if hint.allows(number) if isinstance(hint, Roi) else fits(hint, number):
                 return hint
     for hint in _usual(cg, token, number):
         with suppress(Exception):
-            if _holds(hint, number):
-                return _without_negative(hint, number)
+            if fits(hint, number):
+                return without_negative(hint, number)
     return None
 
 
@@ -61,17 +60,7 @@ def _usual(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
         yield from filter(None, (usual(name, value) for name in (*names, token) if name))
 
 
-def _holds(hint: Param | Roi, value: Any) -> bool:
-    """Whether a value is within a range of its own type: 1 is not True, and only integers are odd."""
-    if isinstance(hint, Param) and hint.choices is None:
-        is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-        return is_number and hint.allows(value) and (isinstance(value, numbers.Integral) or not hint.odd)
-    if isinstance(hint, Param) and hint.choices:
-        return isinstance(value, bool) == isinstance(hint.choices[0], bool) and hint.allows(value)
-    return hint.allows(value)
-
-
-def _without_negative(hint: Param, value: Any) -> Param:
+def without_negative(hint: Param, value: Any) -> Param:
     """Return a range that offers no negative values to one that is not negative."""
     if hint.soft is None or value < 0 or hint.soft[0] >= 0:
         return hint

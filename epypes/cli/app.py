@@ -8,13 +8,11 @@ from __future__ import annotations
 import click
 
 from epypes.cli.bundles import check, promote, verify
-from epypes.cli.call import call
-from epypes.cli.demo import demo
+from epypes.cli.call import call, demo
 from epypes.cli.experiment import experiment
 from epypes.cli.failures import failures, replay
-from epypes.cli.keys import keys
 from epypes.cli.lab import lab
-from epypes.cli.operations import doctor, export
+from epypes.cli.machine import doctor, export, keys
 from epypes.cli.recordings import play, record
 from epypes.cli.services import deploy, rollback, serve, set_parameters, stop
 from epypes.cli.status import status

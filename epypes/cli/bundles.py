@@ -28,9 +28,9 @@ _MAX_ROWS: Final = 100
 @click.option("--output", multiple=True, help="Token of the service's answers; may be repeated.")
 @click.option("--sample", multiple=True, help="Variable with a further payload, or a list of them; may be repeated.")
 def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: Sequence[str]) -> None:
-    """Execute a notebook, write its graph as a bundle, and prove it.
+    """Write the graph of a notebook as a bundle, and verify it.
 
-    The bundle is replayed in a fresh process; it must compute the same as the notebook.
+    The notebook is executed in a new kernel. The bundle is replayed in a fresh process, and must compute the same.
     """
     run_promotion(notebook, to, name, output, sample)
     click.echo(f"Promoted {name!r} of {notebook} to {to}: replayed identical in a fresh process.")
@@ -171,12 +171,7 @@ def _to_json(outcome: CheckOutcome) -> dict[str, Any]:
 
 def _print_failures(failures: Sequence[CheckOutcome]) -> None:
     short: dict[str, Any] = {"no_wrap": True, "min_width": 8, "max_width": 24}
-    columns: dict[str, dict[str, Any]] = {
-        "case": short,
-        "check": short,
-        "must be": {"no_wrap": True, "max_width": 24},
-        "reason": {"overflow": "fold", "ratio": 1},
-    }
+    columns = {"case": short, "check": short, "must be": short, "reason": {"overflow": "fold", "ratio": 1}}
     print_table(columns, ((each.case, each.check, each.threshold, each.reason) for each in failures[:_MAX_ROWS]))
     if len(failures) > _MAX_ROWS:
         click.echo(f"and {counted(len(failures) - _MAX_ROWS, 'check')} more")

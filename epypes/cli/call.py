@@ -1,23 +1,41 @@
-"""The command call: one event to a running service, and its answer to files or the terminal."""
+"""Commands that call a service: call, and demo, which makes and serves the bundle before."""
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Sequence
-from contextlib import suppress
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from epypes.cli.options import allow_option, bundle_argument, keys_option, seconds_option
+from epypes.cli.bundles import run_promotion
+from epypes.cli.options import PATH, allow_option, bundle_argument, keys_option, seconds_option
 from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError, UnknownName
 
 if TYPE_CHECKING:
     from epypes.images import Order
     from epypes.service import Answer
+
+_START_TIMEOUT_S: Final = 60.0
+_STOP_TIMEOUT_S: Final = 20.0
+_CALLS: Final = 5
+_EPYPES: Final = (sys.executable, "-m", "epypes.cli")
+
+_address_option: Final = functools.partial(
+    click.option,
+    default="",
+    show_default=False,
+    help="Address that epypes serve was given; needed if the broker has a password.",
+)
 
 
 @click.command()
@@ -33,22 +51,12 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print the times as JSON, in nanoseconds.")
 @keys_option
 @allow_option
-@click.option(
-    "--sub",
-    default="",
-    show_default=False,
-    help="The address given to epypes serve; if a broker wants a password.",
-)
-@click.option(
-    "--pub",
-    default="",
-    show_default=False,
-    help="The address given to epypes serve; if a broker wants a password.",
-)
+@_address_option("--sub")
+@_address_option("--pub")
 def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as_json: bool, **options: Any) -> None:
     """Send an image to a service, and write its answer to a file.
 
-    Or other values: one for each input token. An answer without a file is printed.
+    A service with several input tokens needs one value for each. An answer without --out is printed.
     """
     from epypes.bundle.load import SETTINGS
     from epypes.bundle.manifest import check_manifest
@@ -72,18 +80,14 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     for token, value in answer.tokens.items():
         if token not in files:
             click.echo(f"{token} = {preview(value).text}")
-    print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
+    _print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
 
 
-def print_answer(title: str, answer: Answer) -> None:
+def _print_answer(title: str, answer: Answer) -> None:
     """Print the times of a service's answer as a table."""
     from epypes.display.durations import duration_text
 
-    totals = {
-        "graph overhead": answer.overhead_ns,
-        "run in all": answer.total_ns,
-        "round trip": answer.round_trip_ns,
-    }
+    totals = {"graph overhead": answer.overhead_ns, "run in all": answer.total_ns, "round trip": answer.round_trip_ns}
     functions = [(f"function {name}", duration_text(time)) for name, time in answer.timings_ns.items()]
     rows = [*functions, (), *((name, duration_text(time)) for name, time in totals.items())]
     print_table({"where": {}, "time": {"justify": "right"}}, rows, title)
@@ -142,3 +146,97 @@ def _write(file: str, value: Any, order: Order) -> None:
     else:
         kind = type(value).__name__
         raise ServiceError(file, f"The answer is of type {kind}, not an image. Leave out --out to print it.")
+
+
+@click.command()
+@click.argument("notebook", type=PATH, help="Notebook with a runner.")
+@click.option("--to", type=PATH, default="demo-output", help="Folder for the results.")
+@click.option("--name", default="runner", help="Variable that holds the runner.")
+@click.option("--output", default="edges", help="Image token of the service's answers.")
+def demo(notebook: Path, to: Path, name: str, output: str) -> None:
+    """Promote, verify, serve, call and compare a notebook's graph.
+
+    The service runs in a second process and is called from a third; its answer must be what the notebook computed.
+    """
+    from epypes.acquisition import read_image, write_image
+    from epypes.bundle import verify
+    from epypes.bundle.compare import first_difference
+    from epypes.bundle.load import SAMPLES, SETTINGS
+    from epypes.bundle.settings import read_settings
+    from epypes.wire.samples import load_sample
+
+    to.mkdir(parents=True, exist_ok=True)
+    bundle, answer_file = to / "bundle", to / f"{output}.png"
+    _print_step(1, f"Execute {notebook} in a fresh kernel and promote its {name!r}")
+    run_promotion(notebook, bundle, name, [output])
+    _print_step(2, "Verify: replay the recorded sample in a fresh isolated process")
+    click.echo(f"   {verify(bundle)}")
+    settings = read_settings(bundle / SETTINGS)
+    inputs, outputs = load_sample(bundle / SAMPLES / "000.npz")
+    images = {token: to / f"{token}.png" for token in inputs}
+    for token, file in images.items():
+        write_image(file, inputs[token], settings.order(token))
+    _draw(bundle, inputs, to / "graph.svg")
+    _print_step(3, "Serve the bundle in a second process")
+    with _serve(bundle) as ready:
+        click.echo(f"   {ready}")
+        _print_step(4, f"Call it from a third process, {_CALLS} times, with {', '.join(map(str, images.values()))}")
+        answer = _call(bundle, images, output, answer_file)
+    difference = first_difference(outputs[output], read_image(answer_file, settings.order(output)))
+    _print_step(5, f"Compare {answer_file} with what the notebook computed")
+    if difference:
+        raise ServiceError(answer_file, f"The service's {output!r} differs from the notebook's: {difference}")
+    click.echo(f"   identical: {outputs[output].size} values of {outputs[output].dtype}")
+    _print_answer(f"The fastest of {_CALLS} calls", answer)
+    click.echo(f"Left in {to}: graph.svg, {answer_file.name}, the bundle. Next: make lab, and move the sliders.")
+
+
+def _print_step(number: int, text: str) -> None:
+    click.echo(f"{click.style(f'{number}/5', bold=True)} {text}")
+
+
+def _draw(bundle: Path, inputs: dict[str, Any], file: Path) -> None:
+    """Draw the graph with its values; without Graphviz, print what is missing."""
+    from epypes.bundle import load
+    from epypes.display import to_svg
+    from epypes.errors import LayoutUnavailable
+
+    try:
+        file.write_text(to_svg(load(bundle).run(**inputs)), encoding="utf-8")
+    except LayoutUnavailable as error:
+        click.echo(f"   {error}", err=True)
+
+
+@contextmanager
+def _serve(bundle: Path) -> Iterator[str]:
+    """Serve a bundle in a process of its own while the block runs; yield its READY line."""
+    command = [*_EPYPES, "serve", str(bundle)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:  # noqa: S603 - our own command
+        # Without it, a service that prints nothing would block readline for ever.
+        watchdog = threading.Timer(_START_TIMEOUT_S, process.kill)
+        watchdog.start()
+        try:
+            ready = process.stdout.readline().strip() if process.stdout else ""
+            watchdog.cancel()
+            if not ready.startswith("READY"):
+                raise ServiceError(bundle, f"The service did not start: {ready or 'see its message above'}")
+            yield ready
+        finally:
+            watchdog.cancel()
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def _call(bundle: Path, images: dict[str, Path], output: str, file: Path) -> Answer:
+    from epypes.service import Answer
+
+    inputs = [f"{token}={path}" for token, path in images.items()]
+    options = ["--out", f"{output}={file}", "--count", str(_CALLS), "--json"]
+    command = [*_EPYPES, "call", str(bundle), *inputs, *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own command
+    if done.returncode:
+        raise ServiceError(bundle, f"The call failed: {done.stderr.strip()}")
+    return Answer(**json.loads(done.stdout))

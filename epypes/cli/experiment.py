@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from epypes.cli.options import PATH, allow_option, keys_option, seconds_option
+from epypes.cli.options import PATH, seconds_option
 from epypes.cli.terminal import print_table
 from epypes.errors import ExperimentError
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from epypes.experiment import Results
 
 _MAX_DRAWINGS: Final = 200
-# Python parses no longer number.
-_MAX_DIGITS: Final = 100
+# Python parses no number of 4,300 digits.
+_LONGEST_NUMBER: Final = 100
 # Columns of the printed table, and of the summary.
 _COLUMNS: Final = {
     "median": "median_ms",
@@ -38,8 +38,6 @@ _COLUMNS: Final = {
 @click.option("--camera", multiple=True, help="Image, folder, video or device number; twice. Default: a stereo pair.")
 @seconds_option("--timeout", 5.0, "Longest wait for one answer")
 @click.option("--unsafe-pickle", is_flag=True, help="Send and read pickled contents, as in 2019.")
-@keys_option
-@allow_option
 @click.option("--out", "to", type=PATH, help="Folder for requests.csv and Figures 14, 15 and 16 as SVG.")
 def experiment(layout: str, workers: int, camera: Sequence[str], to: Path | None, **options: Any) -> None:
     """Run the experiment of the paper.
@@ -58,16 +56,12 @@ def experiment(layout: str, workers: int, camera: Sequence[str], to: Path | None
     # Drawing takes the processor from what is measured: it is done between requests, and not often.
     often = {"update_min_steps": max(1, total // _MAX_DRAWINGS), "hidden": not sys.stderr.isatty()}
     with click.progressbar(length=total, label=f"layout {layout}", file=sys.stderr, **often) as bar:
-        cameras = [_parse_camera(text) for text in camera]
+        cameras = [int(text) if text.isdecimal() and len(text) < _LONGEST_NUMBER else text for text in camera]
         results = run_experiment(layout, workers=workers, cameras=cameras, progress=lambda *_: bar.update(1), **options)
     _print_results(results)
     if to is not None:
         written = _write(results, to, side_by_side=workers > 1)
         click.echo(f"Left in {to}: {', '.join(path.name for path in written)}.")
-
-
-def _parse_camera(text: str) -> str | int:
-    return int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else text
 
 
 def _print_results(results: Results) -> None:
@@ -89,11 +83,8 @@ def _write(results: Results, folder: Path, *, side_by_side: bool) -> list[Path]:
     from epypes.experiment.figures import figure_14, figure_15, figure_16
 
     table, csv = results.table, folder / "requests.csv"
-    figures = {
-        folder / "figure_14.svg": figure_14(table),
-        folder / "figure_15.svg": figure_15(table, side_by_side=side_by_side),
-        folder / "figure_16.svg": figure_16(table),
-    }
+    drawn = {14: figure_14(table), 15: figure_15(table, side_by_side=side_by_side), 16: figure_16(table)}
+    figures = {folder / f"figure_{number}.svg": figure for number, figure in drawn.items()}
     try:
         results.to_csv(csv)
         for path, figure in figures.items():

@@ -110,7 +110,7 @@ def _print_failures(records: Sequence[FailedEvent]) -> None:
 @seconds_option("--timeout", 30.0, "Longest time for the event", least=0.001)
 @click.option("--trace", is_flag=True, help="Print the whole traceback.")
 def replay(failure: str, source: str | None, bundle: Path | None, timeout_s: float, trace: bool) -> None:
-    """Run an event that failed again, in a process of its own.
+    """Run a failed event again, in a separate process.
 
     Exit 0 only if no function fails now.
     """

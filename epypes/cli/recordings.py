@@ -34,7 +34,7 @@ _SPEED: Final = click.FloatRange(0.0)
 def record(
     address: str, file: Path, topic: str, seconds: float | None, messages: int | None, force: bool, **access: Any
 ) -> None:
-    """Write messages that are published into a file.
+    """Record published messages in a file.
 
     The recording ends at SIGTERM or Ctrl+C, or after a time or number of messages.
     """
@@ -73,7 +73,7 @@ def record(
 @keys_option
 @allow_option
 def play(file: Path, address: str, speed: float, loop: int, wait: bool, only_info: bool, **access: Any) -> None:
-    """Publish the messages of a file again.
+    """Publish the messages of a recording again.
 
     The intervals between them are those of the recording.
     """

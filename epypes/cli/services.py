@@ -13,6 +13,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from threading import TIMEOUT_MAX
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, TextIO, cast
 
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 _ANY_PORT: Final = "tcp://127.0.0.1:*"
 _DIGITS: Final = 12
-# The kernel takes a C int.
-_MAX_POLL_MS: Final = 2**31 - 1
 
 _http_option: Final = click.option(
     "--http", default="", show_default=False, help="URL of the service, as http://127.0.0.1:8642."
@@ -135,7 +134,7 @@ def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **o
 
     A broker's address is amqp://, nats:// or mqtt://[USER@]HOST/NAME.
 
-    Its password is in a file, which ?password_file=PATH names: lists of processes show addresses.
+    Its password is read from a file, ?password_file=PATH, since process lists show addresses.
 
     More options follow with & (quote the address): create=true, attempts=3, dead=NAME, group=NAME, kind=broadcast,
     vhost=NAME, ca=FILE.
@@ -187,27 +186,23 @@ def _print_ready(bundle: Path, state: ServiceState) -> None:
 @seconds_option("--timeout", 30.0, "Longest wait for its end")
 @replica_option
 def stop(source: str, timeout_s: float, replica: str) -> None:
-    """End a running service; accepted events are answered first.
+    """Stop a running service; accepted events are answered first.
 
-    All services of the bundle that this user runs here are ended, or the replica that is named, as by SIGTERM.
+    SIGTERM goes to all services of the bundle that this user runs on this machine, or to one named replica.
     """
     states = states_of(source, replica)
-    end_s = monotonic() + timeout_s
+    end_s = monotonic() + min(timeout_s, TIMEOUT_MAX)
+    late = []
     with ExitStack() as opened:
-        processes = [(state, _terminate(source, state, opened)) for state in states]
-        late = []
-        for state, process in processes:
-            if process is not None and not _wait_for_end(process, max(end_s - monotonic(), 0.0)):
-                late.append(_describe_process(source, state))
-                continue
-            named = f", replica {state.replica}" if state.replica else ""
-            click.echo(f"STOPPED {source}{named}, process {state.pid}.")
+        # All are ended before the first is waited for.
+        for state, process in [(state, _terminate(source, state, opened)) for state in states]:
+            if process is None or select.select([process], [], [], max(end_s - monotonic(), 0.0))[0]:
+                named = f", replica {state.replica}" if state.replica else ""
+                click.echo(f"STOPPED {source}{named}, process {state.pid}.")
+            else:
+                late.append(f"Process {state.pid}, which serves {source},")
     if late:
         raise ServiceError(source, f"{' '.join(late)} has not ended within {timeout_s:g} s. Wait longer: --timeout.")
-
-
-def _describe_process(source: str, state: ServiceState) -> str:
-    return f"Process {state.pid}, which serves {source},"
 
 
 def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | None:
@@ -222,15 +217,9 @@ def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | Non
     except ProcessLookupError:
         return None
     except OSError as error:
-        text = f"{_describe_process(source, state)} can't be ended: {error.strerror}."
+        text = f"Process {state.pid}, which serves {source}, can't be ended: {error.strerror}."
         raise ServiceError(source, text) from error
     return process
-
-
-def _wait_for_end(process: int, timeout_s: float) -> bool:
-    poll = select.poll()
-    poll.register(process, select.POLLIN)
-    return bool(poll.poll(min(timeout_s * 1000, _MAX_POLL_MS)))
 
 
 @click.command("set")
@@ -241,8 +230,8 @@ def _wait_for_end(process: int, timeout_s: float) -> bool:
 def set_parameters(source: str, values: Sequence[str], token_file: Path | None, replica: str) -> None:
     """Set hyperparameters of a running service.
 
-    They change between two events, all or none. Replicas that share a queue follow the one that is set. epypes deploy
-    forgets them.
+    All values change together, between two events. Replicas that share a queue take them over. epypes deploy resets
+    them.
     """
     wanted = dict(_parse_assignment(text) for text in values)
     with connect_to(source, token_file, replica) as service:
@@ -270,7 +259,7 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
 @_service_option
 @token_file_option
 def deploy(bundle: Path, http: str, service: str, token_file: Path | None) -> None:
-    """Have a running service serve another bundle.
+    """Deploy another bundle to a running service.
 
     The service replays the bundle first; if it computes something else, the service keeps the old one.
     """
@@ -285,7 +274,7 @@ def deploy(bundle: Path, http: str, service: str, token_file: Path | None) -> No
 @_service_option
 @token_file_option
 def rollback(http: str, service: str, token_file: Path | None) -> None:
-    """Have a running service serve the previous bundle again.
+    """Return a running service to its previous bundle.
 
     A second rollback returns to the bundle before the first.
     """

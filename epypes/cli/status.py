@@ -16,9 +16,10 @@ from epypes.errors import EpypesError
 if TYPE_CHECKING:
     from epypes.service.state_file import ServiceState
 
-_COUNTS: Final = ("received", "answered", "failed", "dropped", "waiting")
-# Counted besides where a broker delivers the events.
-_BROKER_COUNTS: Final = ("dead_letters", "redelivered", "duplicates", "given_back")
+_COUNTS: Final = (
+    *("received", "answered", "failed", "dropped", "waiting"),
+    *("dead_letters", "redelivered", "duplicates", "given_back"),
+)
 _NO_GROUP: Final[dict[str, Any]] = {"members": [], "lost": [], "trouble": ""}
 # The state of a service that can't be asked, since it has no HTTP control.
 _UNKNOWN: Final = "RUNNING"
@@ -36,8 +37,8 @@ Info = dict[str, Any]
 def status(source: str, as_json: bool, replica: str) -> None:
     """Show the state of a running service.
 
-    Also its addresses, its counts of events and its parameters; and the replicas that share its events, unless one is
-    named.
+    The output has its addresses, event counts and parameters, and all replicas that share its events. With --replica
+    it describes one replica.
     """
     if is_url(source):
         services = [_ask(source)]
@@ -113,8 +114,7 @@ def _describe_bundle(service: Info) -> str:
 
 
 def _print_counts(counts: dict[str, int]) -> None:
-    names = (*_COUNTS, *_BROKER_COUNTS) if "redelivered" in counts else _COUNTS
-    texts = (f"{counts[name]} {name.replace('_', ' ')}" for name in names if name in counts)
+    texts = (f"{counts[name]} {name.replace('_', ' ')}" for name in _COUNTS if name in counts)
     click.echo(f"Events: {', '.join(texts)}.")
 
 
@@ -134,7 +134,9 @@ def _print_group(services: list[Info], *, with_members: bool) -> None:
     """Print what the replicas of one queue have in common, then a line for each, on whichever machine it runs."""
     # A replica that is cut off from the broker hears no other: the one that hears most describes the group.
     asked = [service for service in services if "group" in service]
-    first = max(asked, key=_heard, default=services[0])
+    first = max(
+        asked, key=lambda each: (not each["group"]["trouble"], len(each["group"]["members"])), default=services[0]
+    )
     group = first.get("group", _NO_GROUP)
     if asked:
         click.echo(_describe_group(first, group))
@@ -149,14 +151,9 @@ def _print_group(services: list[Info], *, with_members: bool) -> None:
     bundles = {(member.get("name", ""), member["digest"]) for member in group["members"]}
     # One broker is away for all of them: its reason is printed once. A lost replica has a reason of its own.
     known = {_without_addresses(group["trouble"])}
-    for member in members:
-        click.echo(_describe_member(member, _new_reasons(member, known), with_bundle=len(bundles) > 1))
-    for member in lost:
-        click.echo(_describe_member(member, _new_reasons(member, set()), with_bundle=len(bundles) > 1))
-
-
-def _heard(service: Info) -> tuple[bool, int]:
-    return not service["group"]["trouble"], len(service["group"]["members"])
+    reasons = [_new_reasons(member, known) for member in members] + [_new_reasons(member, set()) for member in lost]
+    for member, reason in zip(members + lost, reasons, strict=True):
+        click.echo(_describe_member(member, reason, with_bundle=len(bundles) > 1))
 
 
 def _describe_group(service: Info, group: dict[str, Any]) -> str:

@@ -26,10 +26,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with optional_import("experiment"):
-        found = getattr(importlib.import_module(f"epypes.experiment.{_HOME[name]}"), name)
-    # So that the next look-up does not come here.
-    globals()[name] = found
-    return found
+        return getattr(importlib.import_module(f"epypes.experiment.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -7,14 +7,11 @@ ground is white, so that text is readable in a dark notebook and on any page.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from io import BytesIO
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-import matplotlib
 import numpy as np
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -26,30 +23,21 @@ from epypes.wording import counted
 if TYPE_CHECKING:
     import pandas as pd
 
+# Matplotlib's own, whatever users have set for figures of theirs. With a fixed salt, the same figure has the same names
+# inside its SVG.
+_STYLE: Final[list[Any]] = [
+    "default",
+    {"axes.spines.right": False, "axes.spines.top": False, "legend.frameon": False, "svg.hashsalt": "epypes"},
+]
 _BLUE: Final = "#0072b2"
-_ORANGE: Final = "#e69f00"
-_GREEN: Final = "#009e73"
 _RED: Final = "#c44e00"
-_INK: Final = "#1f2328"
-_GREY: Final = "#525a64"
-
-# All else is Matplotlib's default, whatever users have set for figures of their own.
-_STYLE: Final[Any] = MappingProxyType(
-    dict.fromkeys(("axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color"), _GREY)
-    | dict.fromkeys(
-        ("axes.labelcolor", "legend.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), _INK
-    )
-    | {"axes.linewidth": 0.8, "axes.spines.right": False, "axes.spines.top": False}
-    # With a fixed salt, the same figure has the same names inside its SVG.
-    | {"legend.fontsize": 9, "legend.frameon": False, "svg.hashsalt": "epypes"}
-)
-_MS, _US = 1e3, 1e6
-_SHOWN_REQUESTS: Final = 100
 _PARTS: Final = {
     "acquisition.t_rp": ("acquisition", _BLUE),
-    "vision.t_rp": ("vision", _ORANGE),
-    "o_network": ("network", _GREEN),
+    "vision.t_rp": ("vision", "#e69f00"),
+    "o_network": ("network", "#009e73"),
 }
+_MS, _US = 1e3, 1e6
+_SHOWN_REQUESTS: Final = 100
 # Of a curve, by as many sigmas from mu as there is something to see: a narrow peak on a wide axis has them all.
 _POINTS: Final = 160
 _SIGMAS: Final = 5.0
@@ -58,18 +46,8 @@ _SIGMAS_LEFT: Final = 2.5
 _BINS: Final = 60
 # What is beside the outermost mark, as a factor.
 _MARGIN: Final = 1.5
-_NO_CURVE: Final = "no curve, since there are no values that differ"
 # On more decades there is no room for numbers at 2 and 5.
 _FEW_DECADES: Final = 3.6
-
-
-@contextmanager
-def _in_style() -> Iterator[None]:
-    """Draw in the style of these figures, whatever the user's own is."""
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
-        yield
 
 
 class Drawing(Figure):
@@ -77,42 +55,18 @@ class Drawing(Figure):
 
     def savefig(self, fname: Any, **options: Any) -> None:
         """Save the figure as Matplotlib does, in its own style."""
-        with _in_style():
+        with style.context(_STYLE):
             super().savefig(fname, **options)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
-        # The PNG is for pages that show no SVG, such as that of a notebook which is not trusted.
-        svg, png = self._saved("svg", metadata={"Date": None}), self._saved("png")
-        return {"text/plain": repr(self), "image/svg+xml": svg.decode(), "image/png": png}
-
-    def _saved(self, kind: str, **options: Any) -> bytes:
-        file = BytesIO()
-        self.savefig(file, format=kind, **options)
-        return file.getvalue()
+        svg, png = BytesIO(), BytesIO()
+        self.savefig(svg, format="svg", metadata={"Date": None})
+        # For pages that show no SVG, such as that of a notebook which is not trusted.
+        self.savefig(png, format="png")
+        return {"text/plain": repr(self), "image/svg+xml": svg.getvalue().decode(), "image/png": png.getvalue()}
 
 
-def _blank(title: str) -> tuple[Drawing, Axes]:
-    """Return a figure with a title and nothing in it, and its axes."""
-    figure = Drawing(figsize=(8, 4.2), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
-    figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
-    return figure, figure.add_subplot()
-
-
-def _with_message(figure: Drawing, axes: Axes, text: str) -> Drawing:
-    """Return the figure with a sentence instead of axes, where there is nothing to draw."""
-    axes.set_axis_off()
-    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
-    return figure
-
-
-def _with_notes(figure: Drawing, axes: Axes, *notes: str, columns: int = 3) -> Drawing:
-    """Return the figure with notes above its axes, and with its legend in so many columns below them."""
-    axes.set_title("; ".join(filter(None, notes)), loc="left", fontsize=9)
-    figure.legend(loc="outside lower left", ncols=columns, handlelength=1.6, columnspacing=1.4)
-    return figure
-
-
-@_in_style()
+@style.context(_STYLE)
 def figure_14(table: pd.DataFrame) -> Figure:
     """Draw 100 requests as stacked bars: what acquisition, vision and the network took of each trip.
 
@@ -137,22 +91,28 @@ def figure_14(table: pd.DataFrame) -> Figure:
     if not has_times.any():
         return _without_data(figure, axes, has_times)
     shown = table[:_SHOWN_REQUESTS]
-    negative = _stack(axes, np.flatnonzero(has_times), shown[has_times])
+    bottom, negative = np.zeros(has_times.sum()), 0
+    for column, (name, colour) in _PARTS.items():
+        times = shown.loc[has_times, column].to_numpy(dtype=float)
+        heights = np.fmax(times, 0) * _MS
+        axes.bar(np.flatnonzero(has_times), heights, width=0.84, bottom=bottom, color=colour, label=name)
+        bottom = bottom + heights
+        negative += int(np.sum(times < 0))
     failed = np.flatnonzero(~has_times)
     if len(failed):
-        axes.plot(failed, np.zeros(len(failed)), "x", color=_INK, label="failed", clip_on=False, zorder=3)
+        axes.plot(failed, np.zeros(len(failed)), "kx", label="failed", clip_on=False, zorder=3)
     axes.set(xlabel="request", ylabel="time, ms", xlim=(-1, len(shown)))
     return _with_notes(
         figure,
         axes,
-        _of_experiments(len(shown), "request", shown["experiment"].nunique()),
+        f"{counted(len(shown), 'request')} of {counted(shown['experiment'].nunique(), 'experiment')}",
         _note(negative, "negative time", "not drawn"),
-        _note(np.sum(~has_times), "request", "failed"),
+        _note(len(failed), "request", "failed"),
         columns=4,
     )
 
 
-@_in_style()
+@style.context(_STYLE)
 def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     """Draw how the graph overhead of the vision component is distributed, beside the paper's.
 
@@ -179,7 +139,7 @@ def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     return _densities(table, "vision.o_cg", "Figure 15: graph overhead", f"o_cg: pipeline time less {less}, µs")
 
 
-@_in_style()
+@style.context(_STYLE)
 def figure_16(table: pd.DataFrame) -> Figure:
     """Draw how the overhead of the vision component's reactive pipeline is distributed, beside the paper's.
 
@@ -187,18 +147,6 @@ def figure_16(table: pd.DataFrame) -> Figure:
     """
     meaning = "o_epypes: from reaction to publishing, less the times of f_in, pipeline and f_out, µs"
     return _densities(table, "vision.o_epypes", "Figure 16: overhead of the reactive pipeline", meaning)
-
-
-def _stack(axes: Axes, places: np.ndarray, rows: pd.DataFrame) -> int:
-    """Draw a stack of bars per request; return how many times were negative, which no bar can show."""
-    bottom, negative = np.zeros(len(rows)), 0
-    for column, (name, colour) in _PARTS.items():
-        times = rows[column].to_numpy(dtype=float)
-        heights = np.fmax(times, 0) * _MS
-        axes.bar(places, heights, width=0.84, bottom=bottom, color=colour, label=name)
-        bottom = bottom + heights
-        negative += int(np.sum(times < 0))
-    return negative
 
 
 def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Figure:
@@ -209,82 +157,92 @@ def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Fi
     rows = table[has_times]
     whole = lognormal_fit(rows[column])
     if not whole.count:
-        return _with_message(
-            figure, axes, f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit."
-        )
+        text = f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit."
+        return _with_message(figure, axes, text)
     experiments = [lognormal_fit(values) for _, values in rows.groupby("experiment")[column]]
     flat = sum(not fitted.has_curve for fitted in experiments)
-    positive = rows.loc[rows[column] > 0, column]
-    _axis(axes, positive, whole, PAPER[column])
+    positive = rows.loc[rows[column] > 0, column] * _US
+    _mark(axes, positive, whole, PAPER[column] * _US)
     axes.set_xlabel(meaning)
-    _histogram(axes, positive)
-    _curves(axes, whole, experiments)
+    if positive.nunique() > 1:
+        # In bins that are equally wide on the axis.
+        bins = np.geomspace(positive.min(), positive.max(), _BINS).tolist()
+        axes.hist(positive, bins=bins, density=True, color="black", alpha=0.16, label="histogram", zorder=0)
+    _draw_curves(axes, whole, experiments)
+    no_curve = "no curve, since there are no values that differ"
     return _with_notes(
         figure,
         axes,
-        _of_experiments(whole.count, "value", len(experiments)),
+        f"{counted(whole.count, 'value')} of {counted(len(experiments), 'experiment')}",
         _note(whole.left_out, "value", "not positive, left out"),
-        _note(flat, "experiment", "without a curve") if whole.has_curve else _NO_CURVE,
+        _note(flat, "experiment", "without a curve") if whole.has_curve else no_curve,
         _note(np.sum(~has_times), "request", "failed"),
     )
 
 
-def _axis(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -> None:
-    """Draw what stands on the axis: the measured range, the mode of all data, and the paper's."""
-    least, most, mode, paper = (_US * time for time in (times.min(), times.max(), whole.mode, paper))
-    measured = f"measured: {_number(least)} to {_number(most)} µs" if least < most else f"measured: {_number(least)} µs"
-    for time, label in ((least, measured), (most, None)):
-        axes.axvline(time, color=_INK, linewidth=3, label=label, ymax=0.25)
-    axes.axvline(mode, color=_INK, linewidth=0.9, label=f"mode: {_number(mode)} µs")
-    axes.axvline(
-        paper, color=_RED, linewidth=1.6, linestyle=(0, (4, 2)), label=f"the paper's mode: {_number(paper)} µs"
-    )
+def _mark(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -> None:
+    """Draw what stands on the axis, in microseconds: the measured range, the mode of all data, and the paper's."""
+    least, most, mode = times.min(), times.max(), whole.mode * _US
+    measured = " to ".join(dict.fromkeys(map(_number, (least, most))))
+    axes.axvline(least, color="black", linewidth=3, ymax=0.25, label=f"measured: {measured} µs")
+    axes.axvline(most, color="black", linewidth=3, ymax=0.25)
+    axes.axvline(mode, color="black", linewidth=0.9, label=f"mode: {_number(mode)} µs")
+    axes.axvline(paper, color=_RED, linewidth=1.6, linestyle="--", label=f"the paper's mode: {_number(paper)} µs")
     # To the left a fit may reach further than what was measured.
     low = min(least, mode, paper, _US * float(np.exp(whole.mu - _SIGMAS_LEFT * whole.sigma))) / _MARGIN
     high = max(most, mode, paper) * _MARGIN
-    axes.set_xscale("log")
-    axes.set_xlim(low, high)
+    axes.set(xscale="log", xlim=(low, high))
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if np.log10(high / low) < _FEW_DECADES else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda time, _: _number(time)))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _histogram(axes: Axes, times: pd.Series[float]) -> None:
-    """Draw how dense the measured values are, in bins that are equally wide on the axis."""
-    if times.nunique() > 1:
-        bins = np.geomspace(_US * times.min(), _US * times.max(), _BINS).tolist()
-        axes.hist(_US * times, bins=bins, density=True, color=_INK, alpha=0.16, label="histogram", zorder=0)
-
-
-def _curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:
+def _draw_curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:
     if not whole.has_curve:
         axes.yaxis.set_visible(False)
         return
     low, high = axes.get_xlim()
+
+    def density(fitted: LogNormal) -> tuple[np.ndarray, np.ndarray]:
+        """Return microseconds, and how dense the distribution is there, per microsecond."""
+        times = np.exp(fitted.mu + fitted.sigma * np.linspace(-_SIGMAS, _SIGMAS, _POINTS)) * _US
+        times = np.array([low, *times[(times > low) & (times < high)], high])
+        return times, fitted.pdf(times / _US) / _US
+
     label = "each experiment"
     for fitted in experiments:
         if fitted.has_curve:
-            axes.fill_between(*_density(fitted, low, high), color=_BLUE, alpha=0.2, linewidth=0, label=label)
+            axes.fill_between(*density(fitted), color=_BLUE, alpha=0.2, linewidth=0, label=label)
             label = ""
-    axes.plot(*_density(whole, low, high), color=_BLUE, linewidth=2.8, label="all data")
-    axes.set_ylabel("probability density, per µs")
+    axes.plot(*density(whole), color=_BLUE, linewidth=2.8, label="all data")
+    axes.set(ylabel="probability density, per µs")
     axes.set_ylim(bottom=0)
 
 
-def _density(fitted: LogNormal, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return microseconds, and how dense a distribution is there, per microsecond."""
-    times = np.exp(fitted.mu + fitted.sigma * np.linspace(-_SIGMAS, _SIGMAS, _POINTS)) * _US
-    times = np.array([low, *times[(times > low) & (times < high)], high])
-    return times, fitted.pdf(times / _US) / _US
+def _blank(title: str) -> tuple[Drawing, Axes]:
+    """Return a figure with a title and nothing in it, and its axes."""
+    figure = Drawing(figsize=(8, 4.2), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
+    figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
+    return figure, figure.add_subplot()
+
+
+def _with_notes(figure: Drawing, axes: Axes, *notes: str, columns: int = 3) -> Drawing:
+    """Return the figure with notes above its axes, and with its legend in so many columns below them."""
+    axes.set_title("; ".join(filter(None, notes)), loc="left", fontsize=9)
+    figure.legend(loc="outside lower left", ncols=columns, fontsize=9)
+    return figure
+
+
+def _with_message(figure: Drawing, axes: Axes, text: str) -> Drawing:
+    """Return the figure with a sentence instead of axes, where there is nothing to draw."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+    return figure
 
 
 def _without_data(figure: Drawing, axes: Axes, has_times: np.ndarray) -> Drawing:
     texts = {0: "There is no request.", 1: "The only request failed."}
     return _with_message(figure, axes, texts.get(len(has_times), f"All {len(has_times)} requests failed."))
-
-
-def _of_experiments(count: int, noun: str, experiments: int) -> str:
-    return f"{count:,} {noun}{'s' * (count != 1)} of {counted(experiments, 'experiment')}"
 
 
 def _note(count: int, noun: str, text: str) -> str:

@@ -4,23 +4,31 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from epypes.graph import CompGraph, extend, union
+import numpy as np
+
+from epypes.graph import CompGraph, outputs, union
 from epypes.optional import optional_import
 
-if TYPE_CHECKING:
-    import numpy as np
+Array = np.ndarray[Any, np.dtype[Any]]
 
-    Array = np.ndarray[Any, np.dtype[Any]]
+# Of OpenCV's ORB, which both images share; in the order in which the function takes them.
+_ORB: Final = {
+    "nfeatures": 500,
+    "scaleFactor": 1.2,
+    "nlevels": 8,
+    "edgeThreshold": 31,
+    "WTA_K": 2,
+    # cv2.ORB_HARRIS_SCORE
+    "scoreType": 0,
+    "patchSize": 31,
+    "fastThreshold": 20,
+}
+OPTIONS: Final = tuple(_ORB)
 
-# The hyperparameters that both images share, in the order in which the function takes them.
-OPTIONS: Final = (
-    *("nfeatures", "scaleFactor", "nlevels", "edgeThreshold"),
-    *("WTA_K", "scoreType", "patchSize", "fastThreshold"),
-)
 
-
+@outputs("keypoints", "descriptors")
 def detect_and_describe_features(
     image: Any,
     mask: Any,
@@ -45,19 +53,12 @@ def detect_and_describe_features(
     with optional_import():
         import cv2
 
-    orb = cv2.ORB.create(
-        nfeatures=nfeatures,
-        scaleFactor=scaleFactor,
-        nlevels=nlevels,
-        edgeThreshold=edgeThreshold,
-        WTA_K=WTA_K,
-        scoreType=scoreType,
-        patchSize=patchSize,
-        fastThreshold=fastThreshold,
-    )
+    options = {"WTA_K": WTA_K, "scoreType": scoreType, "patchSize": patchSize, "fastThreshold": fastThreshold}
+    orb = cv2.ORB.create(nfeatures, scaleFactor, nlevels, edgeThreshold, **options)
     return orb.detectAndCompute(image, mask)
 
 
+@outputs("matches")
 def match(descriptors_1: Any, descriptors_2: Any, normType: int, crossCheck: bool) -> list[Any]:
     """Return the matches of two images' descriptors, the nearest ones first."""
     with optional_import():
@@ -69,18 +70,11 @@ def match(descriptors_1: Any, descriptors_2: Any, normType: int, crossCheck: boo
     return sorted(matches, key=lambda found: found.distance)
 
 
+@outputs("keypoints_paired")
 def gather_keypoints(keypoints_1: Any, keypoints_2: Any, matches: Any) -> Array:
     """Return the matched coordinates, float32, (matches, 4): x and y in the first image, x and y in the second."""
-    import numpy as np
-
     pairs = [(*keypoints_1[found.queryIdx].pt, *keypoints_2[found.trainIdx].pt) for found in matches]
     return np.array(pairs, np.float32).reshape(-1, 4)
-
-
-def single_image_graph() -> CompGraph:
-    """Return the graph of one image."""
-    io = {"detect_and_describe_features": (("image", "mask", *OPTIONS), ("keypoints", "descriptors"))}
-    return CompGraph({"detect_and_describe_features": detect_and_describe_features}, io)
 
 
 def orb_graph() -> CompGraph:
@@ -91,15 +85,9 @@ def orb_graph() -> CompGraph:
     >>> orb_graph().sink_tokens
     ('keypoints_paired',)
     """
-    single = single_image_graph()
-    return extend(
-        union(single, single, suffixes=("_1", "_2"), keep=OPTIONS),
-        {"match": match, "gather_keypoints": gather_keypoints},
-        {
-            "match": (("descriptors_1", "descriptors_2", "normType", "crossCheck"), "matches"),
-            "gather_keypoints": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired"),
-        },
-    )
+    single = CompGraph.from_functions(detect_and_describe_features)
+    pair = union(single, single, suffixes=("_1", "_2"), keep=OPTIONS)
+    return union(pair, CompGraph.from_functions(match, gather_keypoints))
 
 
 def orb_hyperparameters() -> dict[str, Any]:
@@ -107,14 +95,7 @@ def orb_hyperparameters() -> dict[str, Any]:
     with optional_import():
         import cv2
 
-    values = (500, 1.2, 8, 31, 2, cv2.ORB_HARRIS_SCORE, 31, 20)
-    return {
-        **dict(zip(OPTIONS, values, strict=True)),
-        "mask_1": None,
-        "mask_2": None,
-        "normType": cv2.NORM_HAMMING,
-        "crossCheck": True,
-    }
+    return {**_ORB, "mask_1": None, "mask_2": None, "normType": cv2.NORM_HAMMING, "crossCheck": True}
 
 
 def stereo_pair() -> tuple[Array, Array]:

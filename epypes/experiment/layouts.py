@@ -29,10 +29,9 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from epypes.errors import EpypesError, ExperimentError
-from epypes.experiment.components import COMPONENTS, Settings
-from epypes.experiment.messages import Request, StereoPair
+from epypes.experiment.nodes import COMPONENTS, Settings, StereoPair, parse_request
 from epypes.pipeline import Mailbox
-from epypes.transport import ZMQPublisher, ZMQSubscriber, read_keys
+from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _START_TIMEOUT_S: Final = 30.0
 # Messages that wait while a publisher is not connected: more than ever do, since the robot makes one request at a time.
@@ -43,32 +42,17 @@ _STOP_TIMEOUT_S: Final = 5.0
 _PRINTED_CHARACTERS: Final = 100_000
 
 # What the first node of a process takes from its subscriber, and what the last gives to its publisher.
-_FROM_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {"acquisition": Request, "vision": StereoPair.from_envelope}
+_FROM_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {
+    "acquisition": parse_request,
+    "vision": StereoPair.from_envelope,
+}
 _TO_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {"acquisition": StereoPair.to_envelope, "vision": lambda it: it}
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Which nodes share a process.
-
-    Attributes
-    ----------
-    processes
-        For each process its nodes, in the order in which an event passes them.
-    in_children
-        Whether these are processes of their own; otherwise there is one, the caller's.
-    """
-
-    processes: tuple[tuple[str, ...], ...]
-    in_children: bool
-
-
-LAYOUTS: Final[Mapping[str, Layout]] = MappingProxyType(
-    {
-        "paper": Layout((("acquisition", "vision"),), in_children=True),
-        "one": Layout((("acquisition", "vision"),), in_children=False),
-        "three": Layout((("acquisition",), ("vision",)), in_children=True),
-    }
+# For each process of its own its nodes, in the order in which an event passes them; without such a process, they run in
+# the caller's.
+LAYOUTS: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = MappingProxyType(
+    {"paper": (("acquisition", "vision"),), "one": (), "three": (("acquisition",), ("vision",))}
 )
 
 
@@ -97,21 +81,14 @@ class Station:
     """
 
     def __init__(self, names: Sequence[str], settings: Settings, scheme: str) -> None:
-        self._scheme, self._settings = scheme, settings
-        self._running = contextlib.ExitStack()
-        self._q_in: Any = queue.SimpleQueue()
+        self._scheme, self._running = scheme, contextlib.ExitStack()
+        q_in: Any = queue.SimpleQueue()
         # Mailboxes, whose items are sent by the thread that puts them: no other one has to wake up for that.
         self._q_out, self._q_failures = Mailbox("drop_oldest", _QUEUE_SIZE), Mailbox("drop_oldest", _QUEUE_SIZE)
-        joints = [
-            self._q_in,
-            *(queue.SimpleQueue() for _ in names[1:]),
-            ConvertingQueue(self._q_out, _TO_SOCKET[names[-1]]),
-        ]
-        self._events = ConvertingQueue(self._q_in, _FROM_SOCKET[names[0]])
-        self.nodes = [
-            COMPONENTS[name](before, after, settings)
-            for name, before, after in zip(names, joints[:-1], joints[1:], strict=True)
-        ]
+        last = ConvertingQueue(self._q_out, _TO_SOCKET[names[-1]])
+        queues = [q_in, *(queue.SimpleQueue() for _ in names[1:]), last]
+        self._events = ConvertingQueue(q_in, _FROM_SOCKET[names[0]])
+        self.nodes = [COMPONENTS[name](queues[i], queues[i + 1], settings) for i, name in enumerate(names)]
         for node in self.nodes:
             node.on_error = self._q_failures.put
 
@@ -126,15 +103,14 @@ class Station:
             A camera gives no frame, or nothing is published at the address.
         """
         enter = self._running.enter_context
-        bound, joined = _curve_options(self._settings, bind=True), _curve_options(self._settings, bind=False)
-        answers = enter(ZMQPublisher(_new_address(self._scheme), self._q_out, **bound))
-        failures = enter(ZMQPublisher(_new_address(self._scheme), self._q_failures, topic="failures", **bound))
+        answers = enter(ZMQPublisher(_new_address(self._scheme), self._q_out))
+        failures = enter(ZMQPublisher(_new_address(self._scheme), self._q_failures, topic="failures"))
         for node in reversed(self.nodes):
             enter(node)
         for node in self.nodes:
             if not node.wait_until_ready(_START_TIMEOUT_S):
                 raise ExperimentError(node.name, f"The {node.name} node has no images after {_START_TIMEOUT_S:g} s.")
-        subscriber = enter(ZMQSubscriber(source, self._events, **joined))
+        subscriber = enter(ZMQSubscriber(source, self._events))
         if not subscriber.wait_joined(_START_TIMEOUT_S):
             raise ExperimentError(self.nodes[0].name, f"Nothing is published at {source}.")
         return {"answers": answers.address, "failures": failures.address}
@@ -142,19 +118,6 @@ class Station:
     def stop(self) -> None:
         """Stop everything; may be called twice."""
         self._running.close()
-
-
-def _curve_options(settings: Settings, *, bind: bool) -> dict[str, Any]:
-    """Return ``keys`` and ``allow`` for a socket of a node: all nodes have one pair, and know each other by it.
-
-    Raises
-    ------
-    KeysError
-        The keys can't be read, or others are allowed without keys.
-    """
-    own = [read_keys(settings.keys)] if settings.keys else []
-    allowed = [*own, *settings.allow] if bind else own
-    return {"keys": own[0] if own else None, "allow": allowed or None}
 
 
 def _new_address(scheme: str) -> str:
@@ -274,8 +237,8 @@ class System:
 
 
 @contextlib.contextmanager
-def running(layout: Layout, settings: Settings) -> Iterator[System]:
-    """Run the nodes of a layout while the block runs.
+def running(processes: Sequence[Sequence[str]], settings: Settings) -> Iterator[System]:
+    """Run the nodes of a layout, one of `LAYOUTS`, while the block runs.
 
     Raises
     ------
@@ -284,22 +247,22 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
     """
     requests = Mailbox("drop_oldest", _QUEUE_SIZE)
     inbox: Any = queue.SimpleQueue()
-    scheme = "tcp" if layout.in_children else "inproc"
+    scheme = "tcp" if processes else "inproc"
     stations: list[Station | ChildStation] = []
     with contextlib.ExitStack() as stack:
-        publisher = ZMQPublisher(_new_address(scheme), requests, **_curve_options(settings, bind=True))
-        stack.enter_context(publisher)
-        for names in layout.processes:
-            in_child = layout.in_children
-            stations.append(ChildStation(names, settings, inbox.put) if in_child else Station(names, settings, scheme))
+        source, failures = stack.enter_context(ZMQPublisher(_new_address(scheme), requests)).address, []
+        for names in processes:
+            stations.append(ChildStation(names, settings, inbox.put))
             stack.callback(stations[-1].stop)
-        source, failures = publisher.address, []
+        if not processes:
+            stations.append(Station(tuple(COMPONENTS), settings, scheme))
+            stack.callback(stations[-1].stop)
         for station in stations:
             addresses = station.start(source)
             source = addresses["answers"]
             failures.append(addresses["failures"])
         for address in (source, *failures):
-            subscriber = stack.enter_context(ZMQSubscriber(address, inbox, **_curve_options(settings, bind=False)))
+            subscriber = stack.enter_context(ZMQSubscriber(address, inbox))
             if not subscriber.wait_joined(_START_TIMEOUT_S):
                 raise ExperimentError("robot", f"Nothing is published at {address}.")
         yield System(requests, inbox, tuple(stations))

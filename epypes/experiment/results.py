@@ -12,18 +12,17 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from epypes.optional import optional_import
+import numpy as np
+import pandas as pd
 
 if TYPE_CHECKING:
-    import numpy as np
-    import pandas as pd
-
     from epypes.experiment.run import Answer
 
 # Seconds, by column of the table: where the curves over all data of the paper's figures 15 and 16 are highest.
 PAPER: Final[Mapping[str, float]] = MappingProxyType({"vision.o_cg": 0.3e-3, "vision.o_epypes": 0.02e-3})
 _COMPONENTS: Final = ("vision", "acquisition")
 _TIMES: Final = ("t_p", "o_cg", "t_fin", "t_fout", "o_epypes")
+_STAMPS: Final = ("t_react", "t_fin_start", "t_fin_end", "t_p", "o_cg", "t_fout_start", "t_fout_end", "t_pub")
 _DURATIONS: Final = (
     "t_trip",
     "acquisition.t_rp",
@@ -64,9 +63,6 @@ class Results:
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return rows as a table with the columns in their order, also of no rows."""
-    with optional_import("experiment"):
-        import pandas as pd
-
     return pd.DataFrame(list(rows), columns=list(COLUMNS)).astype(dict.fromkeys(_DURATIONS, float))
 
 
@@ -93,15 +89,12 @@ def durations_of(t_trip: float, times: Mapping[str, Any]) -> dict[str, float]:
     """
     durations = {"t_trip": t_trip}
     for name in _COMPONENTS:
-
-        def between(start: str, end: str, name: str = name) -> float:
-            return float(times[f"{name}.{end}"] - times[f"{name}.{start}"])
-
-        t_p, t_rp = times[f"{name}.t_p"], between("t_react", "t_pub")
-        t_fin, t_fout = between("t_fin_start", "t_fin_end"), between("t_fout_start", "t_fout_end")
-        values = (t_p, times[f"{name}.o_cg"], t_fin, t_fout, t_rp - (t_p + t_fin + t_fout))
+        time = {stamp: times[f"{name}.{stamp}"] for stamp in _STAMPS}
+        t_rp, t_fin = time["t_pub"] - time["t_react"], time["t_fin_end"] - time["t_fin_start"]
+        t_fout = time["t_fout_end"] - time["t_fout_start"]
+        values = (time["t_p"], time["o_cg"], t_fin, t_fout, t_rp - (time["t_p"] + t_fin + t_fout))
         durations[f"{name}.t_rp"] = t_rp
-        durations |= {f"{name}.{time}": value for time, value in zip(_TIMES, values, strict=True)}
+        durations |= {f"{name}.{key}": value for key, value in zip(_TIMES, values, strict=True)}
     durations["o_network"] = t_trip - sum(durations[f"{name}.t_rp"] for name in _COMPONENTS)
     return durations
 
@@ -114,21 +107,19 @@ def answered(table: pd.DataFrame, *columns: str) -> np.ndarray:
     ValueError
         It is no table of an experiment, or lacks some of the columns that are needed.
     """
-    with optional_import("experiment"):
-        import pandas as pd
-
     if not isinstance(table, pd.DataFrame):
         kind = type(table).__name__
         raise ValueError(f"A table of an experiment is needed, as run_experiment(...).table, not {kind!r}.")
+    if table.empty:
+        return np.zeros(0, dtype=bool)
     missing = [column for column in ("experiment", "failure", *columns) if column not in table]
-    if missing and len(table):
+    if missing:
         names = ", ".join(map(repr, missing))
         raise ValueError(
             f"The table has no column {names}. It must be that of an experiment: run_experiment(...).table."
         )
     # An empty text is missing once the table has been read from a file.
-    failures = table["failure"].fillna("") if len(table) else pd.Series(dtype=str)
-    return (failures == "").to_numpy(dtype=bool)
+    return (table["failure"].fillna("") == "").to_numpy(dtype=bool)
 
 
 def summary(table: pd.DataFrame) -> pd.DataFrame:
@@ -146,9 +137,6 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
         ``median_ms``, ``mode_ms`` of the log-normal distribution, the range from ``least_ms`` to ``most_ms``, and
         ``paper_mode_ms``, nan where the paper names none.
     """
-    with optional_import("experiment"):
-        import pandas as pd
-
     rows = table[answered(table)]
     found = {}
     for time in rows.select_dtypes("number").columns.difference(["experiment", "request"], sort=False):
@@ -191,8 +179,7 @@ class LogNormal:
 
     def pdf(self, times: np.ndarray) -> np.ndarray:
         """Return the probability density at positive times in seconds, per second; nan where there is no curve."""
-        with optional_import("experiment"):
-            from scipy import stats
+        from scipy import stats
 
         return cast("np.ndarray", stats.lognorm.pdf(times, self.sigma or math.nan, scale=math.exp(self.mu)))
 
@@ -208,8 +195,6 @@ def lognormal_fit(values: Iterable[float]) -> LogNormal:
     >>> round(math.exp(fitted.mu), 6), round(fitted.mode, 6), fitted.count, fitted.left_out
     (0.002, 0.001237, 2, 1)
     """
-    import numpy as np
-
     given = np.fromiter(values, float)
     times = given[np.isfinite(given) & (given > 0)]
     if not len(times):

@@ -15,9 +15,8 @@ from typing import Any, Final
 
 from epypes.acquisition.cameras import LAST_DEVICE
 from epypes.errors import ExperimentError, MessageError
-from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
-from epypes.experiment.messages import REQUEST, T_VREQ, decode_keypoints
+from epypes.experiment.nodes import REQUEST, T_VREQ, Settings, decode_keypoints
 from epypes.experiment.results import Results, row_of, table_of
 from epypes.wire import Envelope, Event, JustBytes, add_attribute, attributes, parsed
 
@@ -153,8 +152,6 @@ def run_experiment(
     progress: Callable[[int, int], None] | None = None,
     cameras: Sequence[str | Path | int] = (),
     timeout_s: float = 5.0,
-    keys: str | Path | None = None,
-    allow: Sequence[str | Path] | None = None,
 ) -> Results:
     """Run the paper's experiment: a robot asks, acquisition finds the images, vision finds the keypoints.
 
@@ -181,11 +178,6 @@ def run_experiment(
         comes with scikit-image.
     timeout_s
         Longest wait for one answer.
-    keys
-        The .key_secret file of the pair that all nodes have in common; without, every program on this machine may
-        connect.
-    allow
-        With keys: the .key files, or folders of them, of further peers that may connect to look on.
 
     Returns
     -------
@@ -196,35 +188,23 @@ def run_experiment(
     ------
     ExperimentError
         An option makes no sense, a process has ended, or there are no answers any more.
-    KeysError
-        Keys can't be read, or are not given.
 
     Notes
     -----
     Semeniuta and Falkman 2019, "Evaluation" (Figures 12 to 16).
     """
-    import pandas as pd  # noqa: F401 - missing here, rather than after the last experiment
-
     if layout not in list(LAYOUTS):
         raise ExperimentError("layout", f"There is no layout {layout!r}. There are: {', '.join(LAYOUTS)}.")
     for name, count in {"requests": requests, "experiments": experiments, "workers": workers}.items():
         if type(count) is not int or count < 1:
             raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
     for name, number in {"fps": fps, "timeout_s": timeout_s}.items():
-        if isinstance(number, bool) or not isinstance(number, int | float) or not 0 < number < math.inf:
+        if not isinstance(number, int | float) or not 0 < number < math.inf:
             raise ExperimentError(name, f"{name} must be a number above 0, not {number!r}.")
     if timeout_s > threading.TIMEOUT_MAX:
         text = f"timeout_s must be at most {threading.TIMEOUT_MAX:.0f}, not {timeout_s!r}."
         raise ExperimentError("timeout_s", text)
-    settings = Settings(
-        _checked_cameras(cameras),
-        float(fps),
-        workers,
-        bool(unsafe_pickle),
-        # Absolute, for other processes.
-        "" if keys is None else str(Path(keys).absolute()),
-        tuple(str(Path(path).absolute()) for path in allow or ()),
-    )
+    settings = Settings(_checked_cameras(cameras), fps, workers, unsafe_pickle)
     rows: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
     for experiment in range(experiments):
@@ -247,11 +227,11 @@ def run_experiment(
 
 
 def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ...]:
-    """Return the sources, paths as absolute ones, for other processes."""
+    """Return the sources, paths as text."""
     given = [cameras] if isinstance(cameras, str | Path | int) else list(cameras)
     if len(given) not in (0, 2) or any(not isinstance(source, str | Path | int) for source in given):
         raise ExperimentError("cameras", f"cameras must be two, each a path or the number of a device, not {given!r}.")
     for source in given:
-        if type(source) is int and not 0 <= source <= LAST_DEVICE:
+        if isinstance(source, int) and not 0 <= source <= LAST_DEVICE:
             raise ExperimentError("cameras", f"No camera has the number {source}. They go from 0 to {LAST_DEVICE}.")
-    return tuple(source if type(source) is int else str(Path(str(source)).absolute()) for source in given)
+    return tuple(source if isinstance(source, int) else str(source) for source in given)

@@ -45,7 +45,9 @@ _HANG_REPORT_TIMEOUT_S: Final = 0.5
 _LINES_KEPT: Final = 20
 _READ_BYTES: Final = 64 * 1024
 # How long a process may take to write the stacks of its threads, and how often the file is read meanwhile.
-_TRACE_TIMEOUT_S: Final = 0.5
+_TRACE_TIMEOUT_S: Final = 5.0
+# The main thread is the last one in a trace of faulthandler, and `python -m` begins there.
+_END_OF_TRACE: Final = " in _run_module_as_main\n"
 _TRACE_PERIOD_S: Final = 0.01
 _MAX_TRACE_BYTES: Final = 256 * 1024
 # How long a process may take to end once its socket has.
@@ -163,12 +165,10 @@ class WorkerProcess:
             begin = os.fstat(self._traces).st_size
             self.process.send_signal(signal.SIGUSR1)
             deadline = monotonic() + _TRACE_TIMEOUT_S
-            size = begin
-            while monotonic() < deadline:
-                sleep(_TRACE_PERIOD_S)
-                before, size = size, os.fstat(self._traces).st_size
-                if size == before > begin:
+            while not self._read_traces(begin).endswith(_END_OF_TRACE):
+                if monotonic() > deadline or self.is_stopped:
                     break
+                sleep(_TRACE_PERIOD_S)
             return functions_in_trace(self._read_traces(begin), str(self.module))
         except OSError:
             return ()

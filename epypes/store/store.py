@@ -1,14 +1,13 @@
-r"""A database of series, and series of rows that are written once under each key.
+"""A database of series, and series of rows that are written once under each key.
 
-A row is JSON text that any reader of JSON understands, so NaN and infinities become ``{"$float": "nan"}``. NUL and
-halves of surrogate pairs, which PostgreSQL or UTF-8 refuse, are escaped as ``\u0000``.
+A row is JSON text that any reader of JSON understands, so NaN and infinities become ``{"$float": "nan"}``, and other
+keys that begin with ``$`` get another one. Kinds, names and keys are JSON texts too: databases refuse some characters.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,9 +22,8 @@ if TYPE_CHECKING:
 
     from epypes.store.database import Database
 
-# The key of a float that JSON has no literal for, and of a dict that looks like one.
-_FLOAT, _DICT = "$float", "$dict"
-_SURROGATE: Final = re.compile("[\ud800-\udfff]")
+# The key of a float that JSON has no literal for.
+_FLOAT: Final = "$float"
 
 
 class Store:
@@ -36,6 +34,13 @@ class Store:
     place
         The path of a SQLite file, made if it is not there, or the URL of a database as SQLAlchemy writes it:
         ``"postgresql://user:password@host/database"``.
+
+    Attributes
+    ----------
+    place
+        The path, or the URL without its password.
+    url
+        The URL with its password, for another library that is to use the same database.
 
     Raises
     ------
@@ -54,17 +59,11 @@ class Store:
     def __init__(self, place: str | Path) -> None:
         with optional_import():
             from epypes.store.database import Database
-        self._database = Database(place)
-
-    @property
-    def place(self) -> str:
-        """The path, or the URL without its password."""
-        return self._database.place
-
-    @property
-    def url(self) -> URL:
-        """The URL with its password, for another library that is to use the same database."""
-        return self._database.engine.url
+        self.database = Database(place)
+        self.place = self.database.place
+        self.url: URL = self.database.engine.url
+        # Connects, and makes the tables.
+        self.database.series_names()
 
     def series(self, kind: str, name: str, *, about: Mapping[str, Any] | None = None) -> Series:
         """Return the series of a kind and a name.
@@ -82,19 +81,22 @@ class Store:
         StoreError
             The database can't be read or written.
         """
-        return Series(self._database, kind, name, about)
+        series = Series(self.database, kind, name, about)
+        if about is not None:
+            series.put({})
+        return series
 
     def kinds(self) -> tuple[str, ...]:
         """Return the kinds of all series, sorted."""
-        return tuple(sorted({_unescaped(kind) for kind, _ in self._database.series_names()}))
+        return tuple(sorted({json.loads(kind) for kind, _ in self.database.series_names()}))
 
     def names(self, kind: str) -> tuple[str, ...]:
         """Return the names of the series of a kind, in the order in which they were made."""
-        return tuple(_unescaped(name) for found, name in self._database.series_names() if found == _escaped(kind))
+        return tuple(json.loads(name) for found, name in self.database.series_names() if json.loads(found) == kind)
 
     def close(self) -> None:
         """Close it; a second time does nothing. It and its series can't be read or written any more."""
-        self._database.close()
+        self.database.close()
 
     def __enter__(self) -> Self:
         return self
@@ -135,16 +137,13 @@ class Series:
     def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
         self.kind, self.name = kind, name
         self._database = database
-        self._key = _escaped(kind), _escaped(name)
-        # As the database has it, once that was read; a file that is made anew gets it too.
-        self._about = database.about(self._key, None if about is None else self._text("about", about)) or "{}"
+        self._key = _name_text(kind), _name_text(name)
+        self._about = self.encode("about", about or {})
 
     @property
     def about(self) -> Mapping[str, Any]:
         """The description that the series was made with."""
-        self._about = self._database.about(self._key) or self._about
-        about: dict[str, Any] = _from_text(self._about)
-        return about
+        return self._decode("about", self._database.about(self._key) or self._about)
 
     def append(self, key: str, data: Mapping[str, Any]) -> None:
         """Write a row under a key; if there is one, it is replaced.
@@ -167,43 +166,50 @@ class Series:
             As `append`.
         """
         # The last row of a key is the one that stays.
-        texts = {_escaped(key): self._text(key, data) for key, data in rows}
-        if texts:
-            self._database.put(self._key, self._about, texts)
+        encoded = {key: self.encode(key, data) for key, data in rows}
+        if encoded:
+            self.put(encoded)
 
-    def _text(self, key: str, data: Mapping[str, Any]) -> str:
+    def encode(self, key: str, data: Mapping[str, Any]) -> str:
+        """Return a row as JSON text; raise TypeError, as `append` does."""
         try:
-            return _to_text(dict(data))
+            return json.dumps(_encoded(dict(data)), allow_nan=False, separators=(",", ":"))
         except (TypeError, ValueError, RecursionError) as error:
             raise TypeError(f"Row {key!r:.200} of {self.kind} {self.name!r} can't be stored: {error}.") from error
 
+    def put(self, rows: Mapping[str, str]) -> None:
+        """Write rows that are encoded, by key: all of them, or none; raise StoreError, as `append` does."""
+        self._database.put(self._key, self._about, {_name_text(key): text for key, text in rows.items()})
+
     def get(self, key: str) -> Mapping[str, Any] | None:
         """Return the row under a key; None if there is none."""
-        text = self._database.row(self._key, _escaped(key))
-        return None if text is None else self._data(key, text)
+        text = self._database.row(self._key, _name_text(key))
+        return None if text is None else self._decode(key, text)
+
+    def _decode(self, key: str, text: str) -> dict[str, Any]:
+        try:
+            data: dict[str, Any] = json.loads(text, object_hook=_decoded)
+        except ValueError as error:
+            place = self._database.place
+            raise StoreError(place, f"Row {key!r:.200} of {self.kind} {self.name!r} in {place} is damaged.") from error
+        return data
 
     def keys(self) -> frozenset[str]:
         """Return all keys."""
-        return frozenset(map(_unescaped, self._database.keys(self._key)))
+        return frozenset(map(json.loads, self._database.keys(self._key)))
 
     def items(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield keys with their rows in the order of writing, a page at a time; rows written meanwhile may come too."""
         last = 0
         while page := self._database.page(self._key, last):
-            for last, key, text in page:  # noqa: B007 - where the next page begins
-                yield _unescaped(key), self._data(_unescaped(key), text)
+            for _, key_text, text in page:
+                key = json.loads(key_text)
+                yield key, self._decode(key, text)
+            last = page[-1][0]
 
     def rows(self) -> Iterator[Mapping[str, Any]]:
         """Yield the rows in the order of writing."""
         return (data for _, data in self.items())
-
-    def _data(self, key: str, text: str) -> dict[str, Any]:
-        try:
-            data: dict[str, Any] = _from_text(text)
-        except (ValueError, TypeError, RecursionError) as error:
-            place = self._database.place
-            raise StoreError(place, f"Row {key!r:.200} of {self.kind} {self.name!r} in {place} is damaged.") from error
-        return data
 
     def to_frame(self) -> pd.DataFrame:
         """Return the series as a pandas table: a row by key, a column by name; of dicts in it ``values.canny_lo``."""
@@ -211,15 +217,11 @@ class Series:
             import pandas as pd
 
         found = list(self.items())
-        index = pd.Index([key for key, _ in found], name="key", dtype="object")
-        return pd.DataFrame([dict(_flat(data)) for _, data in found], index=index)
+        frame = pd.json_normalize([dict(data) for _, data in found])
+        return frame.set_axis(pd.Index([key for key, _ in found], name="key", dtype="object"))
 
     def __len__(self) -> int:
         return self._database.count(self._key)
-
-    def __bool__(self) -> bool:
-        # An empty series is a series too, and this needs no query.
-        return True
 
     def __contains__(self, key: object) -> bool:
         return isinstance(key, str) and self.get(key) is not None
@@ -228,73 +230,34 @@ class Series:
         return f"<Series {self.kind} {self.name[:60]!r}>"
 
 
-def _flat(data: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in data.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
-
-
 # -- rows as JSON ------------------------------------------------------------------------------------------------------
 
 
-def _to_text(value: Any) -> str:
-    """Return a value as JSON.
-
-    Raises
-    ------
-    TypeError
-        It contains an object that JSON has no type for, or a key that is no text.
-    RecursionError
-        It contains itself.
-    """
-    text = json.dumps(_encoded(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return _SURROGATE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+def _name_text(name: str) -> str:
+    """Return the JSON text of a kind, name or key."""
+    if not isinstance(name, str):
+        raise TypeError(f"Kinds, names and keys of series are texts, not {type(name).__name__!r}: {name!r:.80}")
+    return json.dumps(name)
 
 
 def _encoded(value: Any) -> Any:
-    """Return a value made of JSON's types alone; numpy's numbers become Python's."""
+    """Return a value as JSON's own types, as far as it is made of such; numpy's numbers become Python's."""
     if isinstance(value, float):
-        return value if math.isfinite(value) else {_FLOAT: str(float(value))}
-    if value is None or isinstance(value, str | int):
-        return value
+        return float(value) if math.isfinite(value) else {_FLOAT: str(float(value))}
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):  # as a text it may be the same as another key: 1 and "1"
                 raise TypeError(f"key {key!r:.80} is no text; as one it is {str(key)!r:.80}")
-        encoded = {key: _encoded(item) for key, item in value.items()}
-        return {_DICT: encoded} if encoded.keys() & {_FLOAT, _DICT} else encoded
+        return {f"${key}" if key.startswith("$") else key: _encoded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_encoded(item) for item in value]
     if getattr(value, "shape", None) == () and hasattr(value, "item"):
         return _encoded(value.item())
-    raise TypeError(f"{type(value).__name__!r} is neither a number, a text, a truth value, a list nor a dict")
+    return value
 
 
-def _from_text(text: str) -> Any:
-    """Return the value of a text; tuples come back as lists."""
-    value = json.loads(text)
-    return _decoded(value) if '{"$' in text else value
-
-
-def _decoded(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_decoded(item) for item in value]
-    if not isinstance(value, dict):
-        return value
-    if value.keys() == {_FLOAT}:
-        return float(value[_FLOAT])
-    inner = value[_DICT] if value.keys() == {_DICT} else value
-    return {key: _decoded(item) for key, item in inner.items()}
-
-
-def _escaped(name: str) -> str:
-    """Return a kind, name or key as every database takes it: the text itself where it can be."""
-    if not isinstance(name, str):
-        raise TypeError(f"Kinds, names and keys of series are texts, not {type(name).__name__!r}: {name!r:.80}")
-    return _to_text(name)[1:-1]
-
-
-def _unescaped(text: str) -> str:
-    return str(json.loads(f'"{text}"'))
+def _decoded(found: dict[str, Any]) -> Any:
+    """Return what an object of JSON stands for, whose values are decoded."""
+    if found.keys() == {_FLOAT}:
+        return float(found[_FLOAT])
+    return {key.removeprefix("$") if key.startswith("$$") else key: value for key, value in found.items()}

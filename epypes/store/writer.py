@@ -6,9 +6,9 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from time import monotonic
 from typing import Any, Final, Generic, TypeVar
 
 from epypes.errors import StoreError
@@ -18,11 +18,8 @@ from epypes.store.store import Series, Store
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
-# A write that failed is tried again after the first pause, then after twice as long, up to the longest; while a caller
-# waits in flush(), after the short one.
-_FIRST_PAUSE_S: Final = 0.5
-_LONGEST_PAUSE_S: Final = 30.0
-_FLUSHING_PAUSE_S: Final = 0.1
+# A write that failed is tried again after this, and at once when a caller begins to wait in flush().
+_RETRY_S: Final = 1.0
 
 # Waiting rows are in memory; a row of an event has about 1 KB.
 _MAX_ROWS: Final = 10_000
@@ -37,8 +34,8 @@ class BackgroundWriter(Generic[_T]):
     name
         The thread's name.
     write
-        Called on the thread with the next items. If it returns False, they stay and are tried again later, with pauses
-        that grow to 30 seconds. If it raises, that is logged and they are dropped.
+        Called on the thread with the next items. If it returns False, they stay and are tried again a second later. If
+        it raises, that is logged and they are dropped.
     most
         How many items may wait.
     at_a_time
@@ -51,7 +48,6 @@ class BackgroundWriter(Generic[_T]):
         self._items: deque[_T] = deque()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self._flushing = 0
 
     def __len__(self) -> int:
         """Return how many items wait or are being written."""
@@ -69,61 +65,48 @@ class BackgroundWriter(Generic[_T]):
     def flush(self, timeout_s: float = 5.0) -> bool:
         """Write all that waits now; return whether that was done in time."""
         with self._changed:
-            self._flushing += 1
             self._start()
-            try:
-                return self._changed.wait_for(lambda: not self._items, timeout_s)
-            finally:
-                self._flushing -= 1
+            self._changed.notify_all()
+            return self._changed.wait_for(lambda: not self._items, timeout_s)
 
     def _start(self) -> None:
         if self._thread is None and self._items:
             thread = threading.Thread(target=self._run, name=self._name, daemon=True)
-            try:
+            with suppress(RuntimeError):  # no more threads, or the interpreter ends: the next put tries again
                 thread.start()
-            except RuntimeError:  # no more threads, or the interpreter ends: the next put tries again
-                return
-            self._thread = thread
-        self._changed.notify_all()
+                self._thread = thread
 
     def _run(self) -> None:
-        pause_s = 0.0
-        while items := self._next(pause_s):
+        while items := self._next():
             try:
                 is_done = self._write(items)
             except Exception:  # the next items must be written, whatever is wrong with these
                 _log.exception("%s could not write", self._name)
                 is_done = True
             with self._changed:
-                pause_s = 0.0 if is_done else min(max(2 * pause_s, _FIRST_PAUSE_S), _LONGEST_PAUSE_S)
                 if is_done:
                     for _ in items:
                         self._items.popleft()
-                self._changed.notify_all()
-            del items  # their memory is given back while the next ones are waited for
+                    self._changed.notify_all()
+                else:
+                    self._changed.wait(_RETRY_S)
 
-    def _next(self, pause_s: float) -> list[_T]:
-        """Return the next items after a pause; none if none wait."""
-        began_s = monotonic()
+    def _next(self) -> list[_T]:
         with self._changed:
-            while self._items:
-                due_s = began_s + (min(pause_s, _FLUSHING_PAUSE_S) if self._flushing else pause_s)
-                if due_s <= monotonic():
-                    return list(islice(self._items, self._at_a_time))
-                self._changed.wait(due_s - monotonic())
-            self._thread = None
-            return []
+            if not self._items:
+                self._thread = None
+            return list(islice(self._items, self._at_a_time))
 
 
-class SeriesWriter:
+class SeriesWriter(BackgroundWriter[tuple[str, str]]):
     """Writes rows to a series on a background thread; while the database is away, they wait.
 
     Parameters
     ----------
     store
-        A path, a URL or a Store. It is opened on the thread too, so that it may be away for now.
-    kind, name, about
-        As for `Store.series`.
+        A path, a URL or a Store. It is opened on the thread, so that it may be away for now.
+    kind, name
+        As for `Store.series`; the first row makes the series.
     most
         How many rows may wait.
     report
@@ -145,88 +128,55 @@ class SeriesWriter:
         kind: str,
         name: str,
         *,
-        about: Mapping[str, Any] | None = None,
         most: int = _MAX_ROWS,
         report: Callable[[str], object] = _log.warning,
     ) -> None:
-        self._kind, self._name, self._about = kind, name, about
-        self._store = store if isinstance(store, Store) else None
-        # Of a store that is opened here, and closed here too.
-        self._place = None if isinstance(store, Store) else store
-        if self._place is not None:
-            with optional_import():
-                from epypes.store.database import check_database
-            check_database(self._place)
-        self._series: Series | None = None
-        self._on_problem = report
+        super().__init__(f"epypes {kind}", self._write_rows, most=most, at_a_time=_ROWS_AT_A_TIME)
+        with optional_import():
+            from epypes.store.database import Database
+        self._is_own = not isinstance(store, Store)
+        self._database = store.database if isinstance(store, Store) else Database(store)
+        self._series = Series(self._database, kind, name)
+        self._report = report
         self._is_away = False
-        self._counts = {"written": 0, "skipped": 0, "unwritten": 0}
-        self._lock = threading.Lock()
-        self._writer = BackgroundWriter(f"epypes {kind}", self._write, most=most, at_a_time=_ROWS_AT_A_TIME)
+        self._written = self._skipped = 0
 
     def append(self, key: str, data: Mapping[str, Any]) -> bool:
-        """Have a row written; return at once, and whether there was room for it. ``data`` must not change any more."""
-        fits = self._writer.put((key, data))
-        with self._lock:
-            self._counts["skipped"] += not fits
+        """Have a row written; return at once, and whether there was room for it.
+
+        Raises
+        ------
+        TypeError
+            data contains an object that JSON has no type for.
+        """
+        fits = self.put((key, self._series.encode(key, data)))
+        with self._changed:
+            self._skipped += not fits
         return fits
 
     def counts(self) -> dict[str, int]:
-        """Return how many rows were written, were skipped (no room), are no JSON (unwritten), and wait."""
-        with self._lock:
-            return {**self._counts, "waiting": len(self._writer)}
-
-    def flush(self, timeout_s: float = 5.0) -> bool:
-        """Write all rows that wait now; return whether that was done in time."""
-        return self._writer.flush(timeout_s)
+        """Return how many rows were written, were skipped (no room), and wait."""
+        return {"written": self._written, "skipped": self._skipped, "waiting": len(self)}
 
     def close(self, timeout_s: float = 5.0) -> bool:
-        """Write all rows that wait, and close a store that was opened for it; return whether that was done in time."""
+        """Write all rows that wait, and disconnect from a store that was opened; return whether that was in time."""
         is_done = self.flush(timeout_s)
-        if is_done and self._place is not None and self._store is not None:
-            self._store.close()
-            # A later row opens it again.
-            self._store = self._series = None
+        if self._is_own:
+            # A later row connects again.
+            self._database.engine.dispose()
         return is_done
 
-    # on the thread, to the end of the class
-
-    def _write(self, rows: list[tuple[str, Mapping[str, Any]]]) -> bool:
+    def _write_rows(self, rows: list[tuple[str, str]]) -> bool:
+        about = f"{self._series.kind} {self._series.name!r}"
         try:
-            unwritten = self._put(rows)
+            self._series.put(dict(rows))
         except StoreError as error:
             is_first, self._is_away = not self._is_away, True
             if is_first:
-                self._report(f"{error} Rows of {self._kind} {self._name!r} wait for it.")
+                self._report(f"{error} Rows of {about} wait for it.")
             return False
-        with self._lock:
-            self._counts["written"] += len(rows) - unwritten
-            self._counts["unwritten"] += unwritten
         if self._is_away:
-            _log.info("Rows of %s %r are written again.", self._kind, self._name)
+            _log.info("Rows of %s are written again.", about)
         self._is_away = False
+        self._written += len(rows)
         return True
-
-    def _put(self, rows: list[tuple[str, Mapping[str, Any]]]) -> int:
-        """Write rows; return how many can never be written, since they are no JSON."""
-        if self._series is None:
-            self._store = Store(self._place or "") if self._store is None else self._store
-            self._series = self._store.series(self._kind, self._name, about=self._about)
-        try:
-            self._series.append_all(rows)
-            return 0
-        except TypeError:  # of one row; the others are written
-            unwritten = 0
-        for key, data in rows:
-            try:
-                self._series.append(key, data)
-            except TypeError as error:
-                unwritten += 1
-                self._report(str(error))
-        return unwritten
-
-    def _report(self, text: str) -> None:
-        try:
-            self._on_problem(text)
-        except Exception:  # the rows must be written, whatever is wrong with the caller's function
-            _log.exception("the function that gets reports of %s %r failed", self._kind, self._name)

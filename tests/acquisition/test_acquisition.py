@@ -134,7 +134,7 @@ def test_before_the_first_frame_there_is_none():
             acquisition.nearest(now_ns)
 
 
-def test_a_camera_never_waits_for_a_request_and_memory_stays_flat():
+def test_a_camera_never_waits_for_a_request_and_lets_go_of_old_frames():
     alive = weakref.WeakValueDictionary()
     numbers = itertools.count()
 
@@ -146,10 +146,13 @@ def test_a_camera_never_waits_for_a_request_and_memory_stays_flat():
     with ep.ImageAcquisition(Fresh(make), size=4) as acquisition:
         until(lambda: frames(acquisition)[0] > 2_000)
         first = newest(acquisition)[0]
-        until(lambda: frames(acquisition)[0] > first.number + 100)
-        assert newest(acquisition)[0].number > first.number
+        number, image = first.number, weakref.ref(first.image)
+        del first
+        until(lambda: frames(acquisition)[0] > number + 100)
+        assert newest(acquisition)[0].number > number
         assert len(acquisition.rings[0]) == 4
-        assert 4 <= len(alive) < 20
+        assert len(alive) < 20
+        until(lambda: image() is None)
 
 
 # What is copied
@@ -211,11 +214,8 @@ def test_a_part_of_a_buffer_of_others_is_copied(part):
         assert type(frame.image) is np.ndarray
 
 
-@pytest.mark.parametrize(
-    "make", [lambda: np.zeros((6, 8)), lambda: np.zeros((6, 9))[:, 1:], lambda: np.frombuffer(bytes(48), np.uint8).reshape(6, 8)]
-)  # fmt: skip
-def test_a_new_array_that_nobody_else_knows_is_not_copied(make):
-    camera = Fresh(make)
+def test_a_new_array_that_nobody_else_knows_is_not_copied():
+    camera = Fresh(lambda: np.zeros((6, 8)))
     with ep.ImageAcquisition(ep.camera(camera, fps=100)) as acquisition:
         assert acquisition.wait_for_frames(5)
         (frame,) = newest(acquisition)
@@ -229,16 +229,6 @@ def test_an_array_of_another_class_becomes_a_plain_one():
     with ep.ImageAcquisition(ep.camera(Fresh(lambda: gray(1).view(Tagged)), fps=100)) as acquisition:
         assert acquisition.wait_for_frames(5)
         assert type(newest(acquisition)[0].image) is np.ndarray
-
-
-def test_a_still_image_is_the_same_array_in_each_frame():
-    with ep.ImageAcquisition(ep.camera(gray(1), fps=1_000)) as acquisition:
-        until(lambda: frames(acquisition)[0] > 3)
-        first = newest(acquisition)[0]
-        until(lambda: frames(acquisition)[0] > first.number + 3)
-        later = newest(acquisition)[0]
-        assert later.number > first.number
-        assert later.image is first.image
 
 
 def test_frames_can_not_be_written_to():

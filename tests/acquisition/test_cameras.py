@@ -102,11 +102,13 @@ def test_a_folder_without_images_is_named(tmp_path):
     assert info.value.path == str(tmp_path)
 
 
-def test_a_broken_image_in_a_folder_is_named(tmp_path, capfd):
+def test_a_broken_image_in_a_folder_is_named_when_its_turn_comes(tmp_path, capfd):
     write_image(tmp_path / "1.png", GRAY)
     (tmp_path / "2.png").write_bytes(b"not an image")
+    camera = ep.camera(tmp_path, fps=math.inf)
+    assert np.array_equal(camera.read(), GRAY)
     with pytest.raises(ImageFileError, match=r"2\.png' is not an image") as info:
-        ep.camera(tmp_path)
+        camera.read()
     assert info.value.path == str(tmp_path / "2.png")
     assert capfd.readouterr() == ("", "")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import queue
 import signal
 import subprocess
 import sys
@@ -15,11 +14,10 @@ import psutil
 import pytest
 
 from epypes.errors import ExperimentError, ImageFileError
-from epypes.experiment.components import COMPONENTS, Settings
 from epypes.experiment.layouts import LAYOUTS, ChildStation, running
+from epypes.experiment.nodes import Settings
 from epypes.experiment.run import Robot
 from epypes.pipeline import FullPipeline
-from epypes.transport import ZMQSubscriber, make_keys
 
 TIMEOUT_S = 60.0
 IN_CHILDREN = pytest.mark.slow
@@ -47,38 +45,11 @@ def _command(child: psutil.Process) -> list[str]:
 
 
 def test_the_layouts_are_those_of_the_paper_and_the_two_beside_it():
-    assert {name: layout.processes for name, layout in LAYOUTS.items()} == {
+    assert dict(LAYOUTS) == {
         "paper": (("acquisition", "vision"),),
-        "one": (("acquisition", "vision"),),
+        "one": (),
         "three": (("acquisition",), ("vision",)),
     }
-    assert [name for name, layout in LAYOUTS.items() if not layout.in_children] == ["one"]
-
-
-def test_a_layout_has_nothing_but_the_process_of_each_node():
-    assert set(LAYOUTS["paper"].__slots__) == {"processes", "in_children"}
-    assert all(name in COMPONENTS for layout in LAYOUTS.values() for names in layout.processes for name in names)
-
-
-@IN_CHILDREN
-def test_nodes_with_keys_know_each_other_and_no_stranger(images, tmp_path):
-    own, watcher = make_keys(tmp_path / "own"), make_keys(tmp_path / "watcher")
-    settings = Settings(images, fps=50.0, keys=str(tmp_path / "own"), allow=(str(tmp_path / "watcher.key"),))
-    with running(LAYOUTS["three"], settings) as system:
-        assert not robot_of(system).ask().is_missing
-        answers = system.stations[1].addresses["answers"]
-        with (
-            ZMQSubscriber(answers, queue.SimpleQueue()) as stranger,
-            ZMQSubscriber(answers, queue.SimpleQueue(), keys=watcher, allow=own) as known,
-        ):
-            assert known.wait_joined(TIMEOUT_S)
-            assert not stranger.wait_joined(0.1)
-
-
-def test_nodes_of_one_process_take_keys_too(images, tmp_path):
-    make_keys(tmp_path / "own")
-    with running(LAYOUTS["one"], Settings(images, fps=50.0, keys=str(tmp_path / "own"))) as system:
-        assert not robot_of(system).ask().is_missing
 
 
 def test_in_one_process_a_request_is_answered(images):
@@ -147,7 +118,7 @@ def test_a_vision_process_that_is_stopped_is_a_request_without_answer(images):
 def test_no_process_outlives_its_parent_however_that_ends(images):
     code = (
         "import sys; from epypes.experiment.layouts import LAYOUTS, running\n"
-        "from epypes.experiment.components import Settings\n"
+        "from epypes.experiment.nodes import Settings\n"
         f"with running(LAYOUTS['three'], Settings({images!r}, 50.0)) as system:\n"
         "    print(*(station.pid for station in system.stations), flush=True); sys.stdin.read()"
     )
@@ -167,7 +138,7 @@ def test_a_process_that_hangs_while_it_starts_ends_with_its_parent(end, tmp_path
     os.mkfifo(pipe)
     code = (
         "from epypes.experiment.layouts import ChildStation\n"
-        "from epypes.experiment.components import Settings\n"
+        "from epypes.experiment.nodes import Settings\n"
         f"station = ChildStation(['acquisition'], Settings(({str(pipe)!r},) * 2), print)\n"
         "print(station.pid, flush=True); station.start('tcp://127.0.0.1:1')"
     )

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from epypes.errors import ExperimentError
-from epypes.experiment.messages import encode_keypoints
+from epypes.experiment.nodes import encode_keypoints
 from epypes.experiment.run import Robot
 from epypes.run import Failure
 from epypes.wire import Envelope, JustBytes, add_attribute, attributes, failure_event

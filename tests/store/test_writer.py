@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import sqlite3
 import threading
@@ -17,15 +16,14 @@ from tests.store.postgres import server
 
 
 def test_rows_are_written_in_order_and_what_was_opened_is_closed(place):
-    writer = SeriesWriter(place, "events", "edges", about={"of": "a test"})
+    writer = SeriesWriter(place, "events", "edges")
     for number in range(1_000):
         assert writer.append(f"{number}", {"n": number})
     assert writer.close(30)
-    assert writer.counts() == {"written": 1_000, "skipped": 0, "unwritten": 0, "waiting": 0}
+    assert writer.counts() == {"written": 1_000, "skipped": 0, "waiting": 0}
     with Store(place) as store:
         series = store.series("events", "edges")
         assert [row["n"] for row in series.rows()] == list(range(1_000))
-        assert series.about == {"of": "a test"}
 
 
 def test_a_writer_that_was_closed_opens_its_store_again(place):
@@ -45,15 +43,14 @@ def test_a_store_that_was_given_stays_open(store):
     assert store.series("events", "edges").keys() == {"a"}
 
 
-def test_what_can_not_be_written_at_all_holds_nothing_else_up(store, caplog):
+def test_what_is_no_json_is_refused_at_once_and_holds_nothing_else_up(store):
     writer = SeriesWriter(store, "events", "edges")
-    for number in range(10):
-        writer.append(f"{number}", {"n": object() if number == 4 else number})
-    assert writer.flush(30)
-    assert writer.counts()["unwritten"] == 1
-    assert writer.counts()["written"] == 9
-    assert len(store.series("events", "edges")) == 9
-    assert "Row '4' of events 'edges' can't be stored" in caplog.text
+    writer.append("before", {"n": 1})
+    with pytest.raises(TypeError, match="Row 'bad' of events 'edges' can't be stored"):
+        writer.append("bad", {"n": object()})
+    writer.append("after", {"n": 2})
+    assert writer.flush(60)
+    assert store.series("events", "edges").keys() == {"before", "after"}
 
 
 @pytest.mark.slow
@@ -73,7 +70,7 @@ def test_a_caller_does_not_wait_for_the_database_and_rows_that_do_not_fit_are_co
         other.execute("ROLLBACK")
         other.close()
         assert writer.flush(60)
-        assert writer.counts() == {"written": 50, "skipped": 30, "unwritten": 0, "waiting": 0}
+        assert writer.counts() == {"written": 50, "skipped": 30, "waiting": 0}
         assert sorted(row["n"] for row in series.rows()) == list(range(50))
 
 
@@ -108,34 +105,32 @@ def test_a_place_that_can_never_be_is_refused_at_once(tmp_path):
         SeriesWriter("nosuch://host/db", "events", "edges")
 
 
-@pytest.mark.slow
-def test_rows_wait_for_a_database_also_if_the_report_of_it_fails(tmp_path, caplog):
+def test_rows_wait_for_a_folder_that_is_away_which_is_reported_once(tmp_path):
     folder = tmp_path / "results"
     folder.mkdir()
+    reports, is_reported = [], threading.Event()
 
     def report(text):
-        raise RuntimeError("no such panel")
+        reports.append(text)
+        is_reported.set()
 
     writer = SeriesWriter(folder / "results.sqlite", "events", "edges", report=report)
     folder.rmdir()
     writer.append("a", {"n": 1})
-    writer.append("bad", {"n": object()})
-    assert not writer.flush(0.5)
+    assert is_reported.wait(60)
     folder.mkdir()
     assert writer.close(60)
-    assert writer.counts() == {"written": 1, "skipped": 0, "unwritten": 1, "waiting": 0}
-    assert "no such panel" in caplog.text
+    assert writer.counts() == {"written": 1, "skipped": 0, "waiting": 0}
+    assert len(reports) == 1
+    assert "Rows of events 'edges' wait for it." in reports[0]
 
 
 @pytest.mark.slow
-def test_what_can_not_be_written_now_is_tried_less_and_less_often_and_at_once_while_a_caller_waits(monkeypatch):
-    monkeypatch.setattr("epypes.store.writer._FIRST_PAUSE_S", 0.05)
-    monkeypatch.setattr("epypes.store.writer._LONGEST_PAUSE_S", 0.2)
-    monkeypatch.setattr("epypes.store.writer._FLUSHING_PAUSE_S", 0.01)
-    tried_s, tried, enough = [], [], threading.Event()
+def test_what_can_not_be_written_now_stays_in_order_and_is_tried_again(monkeypatch):
+    monkeypatch.setattr("epypes.store.writer._RETRY_S", 0.05)
+    tried, enough = [], threading.Event()
 
     def write(items):
-        tried_s.append(monotonic())
         tried.append(list(items))
         if len(tried) == 6:
             enough.set()
@@ -144,11 +139,24 @@ def test_what_can_not_be_written_now_is_tried_less_and_less_often_and_at_once_wh
     writer = BackgroundWriter("a test", write, most=3, at_a_time=2)
     assert [writer.put(number) for number in range(4)] == [True, True, True, False]
     assert enough.wait(60)
-    pauses = [later - earlier for earlier, later in itertools.pairwise(tried_s)]
-    assert all(pause >= least for pause, least in zip(pauses, (0.05, 0.1, 0.2, 0.2, 0.2), strict=False))
     assert writer.flush(60)
     assert [item for items in tried[6:] for item in items] == [0, 1, 2], "in order, and each once"
     assert len(writer) == 0
+
+
+def test_a_write_that_failed_is_tried_again_at_once_when_a_caller_waits(monkeypatch):
+    monkeypatch.setattr("epypes.store.writer._RETRY_S", 3_600.0)
+    tried, is_tried = [], threading.Event()
+
+    def write(items):
+        tried.append(items)
+        is_tried.set()
+        return len(tried) > 1
+
+    writer = BackgroundWriter("a test", write, most=3)
+    writer.put("a")
+    assert is_tried.wait(60)
+    assert any(writer.flush(1.0) for _ in range(60))
 
 
 def test_what_can_not_be_written_at_all_is_logged_and_the_next_is_written(caplog):

@@ -88,6 +88,31 @@ def test_a_peer_of_2019_gets_exactly_one_frame_and_nothing_of_a_join(peer):
         assert socket.recv_multipart() == [b"\x0a\x01x"]
 
 
+def test_a_peer_of_2019_gets_nothing_of_subscribers_that_leave_while_they_join(peer):
+    out = queue.Queue()
+    with ZMQPublisher(LOCAL, out) as pub:
+        socket = peer(zmq.SUB)
+        socket.subscribe(b"")
+        socket.connect(pub.address)
+        assert pub.wait_for_subscriber(WAIT_S)
+        # Each asks again when it has an answer, and leaves at once: often before the second one is sent.
+        for number in range(500):
+            topic = b"\xff\xffepypes/join/%032x" % number
+            leaving = peer(zmq.SUB)
+            leaving.subscribe(topic)
+            leaving.connect(pub.address)
+            deadline_s = monotonic() + WAIT_S
+            is_answered = False
+            while not is_answered:
+                assert monotonic() < deadline_s
+                is_answered = bool(leaving.poll(200))
+                leaving.unsubscribe(topic)
+                leaving.subscribe(topic)
+            leaving.close()
+        out.put(b"x")
+        assert socket.recv_multipart() == [b"x"]
+
+
 def test_a_publisher_of_2019_is_understood(peer):
     socket = peer(zmq.XPUB)
     socket.bind("tcp://127.0.0.1:*")

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from epypes.catalog import entry_of, parameter_names, uses, usual
+from epypes.catalog import entry_of, fits, parameter_names, uses, usual
+from epypes.catalog.ranges import without_negative
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi, Text, param_from_value
-from epypes_widgets.movable import is_integer, is_movable, plain
+from epypes_widgets.movable import is_movable, plain
 from epypes_widgets.places import Tunable
 
 _RECTANGLES: Final = frozenset(("roi", "rect", "rectangle", "crop", "box", "bbox", "window"))
@@ -110,7 +111,7 @@ def _tabled(runner: Tunable, token: str, value: Any) -> Param | None:
     found = _by_function(runner, token, value) or _by_name(runner, token, value)
     if found is None or found.choices is not None:
         return found
-    return _without_negative(found, plain(value))
+    return without_negative(found, plain(value))
 
 
 def _by_function(runner: Tunable, token: str, value: Any) -> Param | None:
@@ -173,20 +174,10 @@ def _valued(runner: Tunable, token: str, value: Any) -> Param | Roi | Text | Non
     return Param(step=param.step, soft=(param.low, param.high))
 
 
+def _fits(param: Param, value: Any) -> bool:
+    return (param.choices is not None or is_movable(value)) and fits(param, value)
+
+
 def words(name: str) -> tuple[str, ...]:
     """Return the words of a name in lower case, numbers apart: ("block", "size", "1") of ``blockSize_1``."""
     return tuple(word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name))
-
-
-def _fits(param: Param, value: Any) -> bool:
-    """Whether a range of the table holds a value of this type: 1 is not True, and only integers are odd."""
-    if param.choices is not None:
-        return isinstance(value, bool) == isinstance(param.choices[0], bool) and param.allows(value)
-    return is_movable(value) and param.allows(value) and (is_integer(value) or not param.odd)
-
-
-def _without_negative(param: Param, value: Any) -> Param:
-    """Return a range that offers no negative values to one that is not negative; they may be typed."""
-    if param.soft is None or value < 0 or param.soft[0] >= 0:
-        return param
-    return replace(param, soft=(type(param.soft[0])(0), max(param.soft[1], value)))

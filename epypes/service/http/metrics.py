@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _NS_PER_S: Final = 1e9
 _STATES: Final = get_args(State)
 _EVENT_OUTCOMES: Final = ("answered", "failed", "dropped", "dead_letters")
-_ROW_OUTCOMES: Final = ("written", "skipped", "unwritten")
+_ROW_OUTCOMES: Final = ("written", "skipped")
 # By name in `Service.counts`: name of the metric, and its description.
 _COUNTERS: Final = {
     "received": ("epypes_events_received", "Events that were accepted."),

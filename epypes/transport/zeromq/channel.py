@@ -125,7 +125,13 @@ class ZeroMQChannel:
                     *SUBSCRIPTION_OPTIONS,
                 ]
                 self._owned = thread.open(
-                    zmq.XPUB, self.address, security, self._read_subscriptions, options, lock=self._lock
+                    zmq.XPUB,
+                    self.address,
+                    security,
+                    self._read_subscriptions,
+                    options,
+                    prepare=self.subscriptions.add_full_subscriber,
+                    lock=self._lock,
                 )
             else:
                 options = [

@@ -34,8 +34,9 @@ _MAX_PUBLISHERS: Final = 512
 _SUBSCRIBE: Final = 1
 _BATCH: Final = 100
 _DONTWAIT: Final = int(zmq.DONTWAIT)
-# ZMQ_XPUB_MANUAL_LAST_VALUE: the next message goes only to the peer whose subscription was read last. It is a draft
-# option, which the libzmq 4.3.5 of pyzmq's wheels takes all the same; where it is refused, the answer goes to all.
+# ZMQ_XPUB_MANUAL_LAST_VALUE: the next message goes only to the peer whose subscription was read last, or to all if that
+# peer has gone. It is a draft option, which the libzmq 4.3.5 of pyzmq's wheels takes all the same; where it is refused,
+# the answer goes to all.
 _ONLY_TO_LAST_PEER: Final = 98
 # In heartbeats. Silence is checked once in each, so that it is reported within three.
 _ASKED_AFTER, _STALE_AFTER = 0.5, 2.0
@@ -50,6 +51,9 @@ class Subscriptions:
 
     The socket is in manual mode, where every subscription of every peer is seen and is granted here, and the answer
     can be sent to the peer that asks and to no other: a peer of 2019 that subscribes to everything sees nothing of it.
+    If the peer that asks has gone, libzmq would send the answer to all. So a subscriber within this process, which
+    reads nothing and whose queue is full, is subscribed to all private topics: libzmq then sends to none of them.
+
     The thread that calls `read` holds the socket's lock; any thread may call the rest.
     """
 
@@ -58,6 +62,35 @@ class Subscriptions:
         # By topic: a peer may take back what it has never had, or was refused.
         self._counts: Counter[bytes] = Counter()
         self._identity = uuid.uuid4().bytes
+
+    def add_full_subscriber(self, socket: Socket) -> Socket | None:
+        """Connect the subscriber whose queue is full to a socket that is not bound yet; return it, to be closed later.
+
+        None if libzmq can't send an answer to one peer alone.
+        """
+        try:
+            socket.setsockopt(_ONLY_TO_LAST_PEER, 0)
+        except zmq.ZMQError:
+            return None
+        finally:
+            socket.setsockopt(zmq.XPUB_MANUAL, 1)
+        full: Socket = socket.context.socket(zmq.SUB)
+        full.setsockopt(zmq.RCVHWM, 1)
+        full.setsockopt(zmq.SUBSCRIBE, _JOIN_PREFIX)
+        high_water_mark = int(socket.getsockopt(zmq.SNDHWM))
+        # Both ends of such a connection count for its queue: it has room for two messages.
+        socket.setsockopt(zmq.SNDHWM, 1)
+        address = f"inproc://epypes-join-{uuid.uuid4().hex}"
+        socket.bind(address)
+        socket.setsockopt(zmq.SNDHWM, high_water_mark)
+        full.connect(address)
+        # Its subscription.
+        socket.recv()
+        socket.setsockopt(zmq.SUBSCRIBE, _JOIN_PREFIX)
+        with contextlib.suppress(zmq.Again):
+            while True:
+                socket.send(_JOIN_PREFIX, zmq.DONTWAIT)
+        return full
 
     def read(self, socket: Socket, guard: ConnectionGuard | None) -> bool:
         """Grant some of the subscriptions that have arrived; return whether there may be more."""
@@ -79,7 +112,7 @@ class Subscriptions:
             return self._changed.wait_for(lambda: bool(self._counts), timeout_s)
 
     def _grant(self, socket: Socket, change: int, topic: bytes) -> None:
-        # It is refused for a peer that has gone meanwhile, and then there is nothing to do.
+        # libzmq ignores it for a peer that has gone meanwhile.
         with contextlib.suppress(zmq.ZMQError):
             socket.setsockopt(zmq.SUBSCRIBE if change > 0 else zmq.UNSUBSCRIBE, topic)
         if topic.startswith(_JOIN_PREFIX):
@@ -98,7 +131,7 @@ class Subscriptions:
                 socket.setsockopt(_ONLY_TO_LAST_PEER, 1)
             socket.send_multipart([topic, self._identity], zmq.DONTWAIT)
         except zmq.Again:
-            # The peer's queue is full; it asks again.
+            # The peer has gone, or its queue is full; then it asks again.
             pass
         except zmq.ZMQError as error:
             log.warning("a join could not be answered: %s", error)

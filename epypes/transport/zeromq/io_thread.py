@@ -70,6 +70,8 @@ class OwnedSocket:
         Where it is bound; the given address if it is connected.
     guard
         What bounds its connections; None unless it is bound to a port or a file.
+    companion
+        A socket that is closed with it.
     """
 
     socket: Socket
@@ -84,6 +86,7 @@ class OwnedSocket:
     tick: Callable[[], None] | None = None
     tick_s: float = float("inf")
     due_s: float = float("inf")
+    companion: Socket | None = None
 
 
 class IOThread:
@@ -122,6 +125,7 @@ class IOThread:
         reader: Reader,
         options: Sequence[tuple[int, int | bytes]],
         *,
+        prepare: Callable[[Socket], Socket | None] | None = None,
         lock: AbstractContextManager[Any] | None = None,
         max_message_bytes: int = 0,
         tick: Callable[[], None] | None = None,
@@ -135,6 +139,8 @@ class IOThread:
             ``zmq.XPUB`` or the like.
         options
             Of ZeroMQ, by number, in this order.
+        prepare
+            Called with the socket that has its options, before it is bound or connected; may return a companion.
         lock
             Held by every thread that touches the socket; None if only the I/O thread does.
         max_message_bytes
@@ -152,10 +158,13 @@ class IOThread:
             self._require_keys(security)
         new: Socket = self._context.socket(kind)
         guard: ConnectionGuard | None = None
+        companion: Socket | None = None
         try:
             # Options count only for what is bound or connected after them.
             for option, value in [*_OPTIONS.items(), *security.socket_options(), *options]:
                 new.setsockopt(option, value)
+            if prepare is not None:
+                companion = prepare(new)
             if security.bind and not address.startswith("inproc:"):
                 # Before it is bound, so that no connection is missed.
                 guard = ConnectionGuard(new, max_message_bytes, self.submit)
@@ -163,13 +172,17 @@ class IOThread:
         except (zmq.ZMQError, UnicodeError, ValueError, TypeError) as error:
             if guard is not None:
                 guard.close()
+            if companion is not None:
+                companion.close(linger=0)
             new.close(linger=0)
             number = getattr(error, "errno", None) or 0
             raise address_error(address, "bound" if security.bind else "connected", number, str(error)) from error
         endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if security.bind else address
         source = new if lock is None else int(new.get(_FD))
         due_s = monotonic() + tick_s
-        owned = OwnedSocket(new, endpoint, reader, lock or nullcontext(), source, security, guard, tick, tick_s, due_s)
+        owned = OwnedSocket(
+            new, endpoint, reader, lock or nullcontext(), source, security, guard, tick, tick_s, due_s, companion
+        )
         self._next_due_s = min(self._next_due_s, due_s)
         self._owned[new] = owned
         if guard is not None:
@@ -401,6 +414,8 @@ atexit.register(_close_at_exit)
 
 
 def _close(owned: OwnedSocket) -> None:
+    if owned.companion is not None:
+        owned.companion.close(linger=0)
     if owned.guard is None:
         owned.socket.close()
         return

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
-from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
+from epypes.experiment.nodes import Settings
 from epypes.experiment.results import durations_of
 from epypes.experiment.run import Robot
 from epypes.wire import attributes

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from epypes.experiment.components import COMPONENTS, Settings, Vision
-from epypes.experiment.messages import Request, StereoPair, decode_keypoints
+from epypes.experiment.nodes import COMPONENTS, Settings, StereoPair, Vision, decode_keypoints, parse_request
 from epypes.run import Failure
 from epypes.wire import Event, add_attribute, attributes
 
@@ -18,10 +17,10 @@ TIMES = ("t_react", "t_fin_start", "t_fin_end", "t_fout_start", "t_fout_end", "t
 TIMEOUT_S = 60.0
 
 
-def request(at: float, request_id: str = "abc") -> Request:
+def request(at: float, request_id: str = "abc") -> Event:
     event = Event(type="vision_request", id=request_id)
     add_attribute(event, "t_vreq", at)
-    return Request(event.SerializeToString())
+    return parse_request(event.SerializeToString())
 
 
 @pytest.fixture
@@ -85,7 +84,7 @@ def test_a_slow_camera_is_no_dead_one(images, queues, fps, is_answered):
 
 def test_what_is_no_request_is_a_failure_and_the_next_one_is_answered(acquisition, queues):
     q_in, q_out = queues
-    q_in.put(Request(b"\xff\xff"))
+    q_in.put(parse_request(b"\xff\xff"))
     assert acquisition.failures.get(timeout=TIMEOUT_S).function == "f_in"
     q_in.put(request(time.time()))
     assert q_out.get(timeout=TIMEOUT_S).id == "abc"

@@ -1,9 +1,11 @@
-"""Commands that prepare a machine for a service: doctor, export."""
+"""Commands that prepare a machine for a service: keys, doctor, export."""
 
 from __future__ import annotations
 
 import getpass
 import json
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -12,11 +14,62 @@ from typing import Final
 import click
 
 from epypes.cli.options import PATH, bundle_argument, json_option
-from epypes.errors import ServiceError
+from epypes.cli.terminal import print_table
+from epypes.errors import KeysError, ServiceError
 
+_NAME: Final = re.compile(r"\w[\w-]*")
 _COLOURS: Final = {"ok": "green", "warning": "yellow", "failed": "red"}
 
 _serve_options: Final = click.argument("options", nargs=-1, metavar="-- OPTIONS", help="Options of epypes serve.")
+
+
+@click.command()
+@click.argument("name", default="", help="Name of the pair, as camera or robot; optional with --list.")
+@click.option("--to", "folder", type=PATH, help="Folder of the keys; default: ~/.config/epypes/keys.")
+@click.option("--list", "listed", is_flag=True, help="Print the public keys in the folder; make none.")
+def keys(name: str, folder: Path | None, listed: bool) -> None:
+    """Make a pair of CURVE keys.
+
+    The output explains which machine needs which file.
+    """
+    from epypes.transport import make_keys
+
+    config = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    folder = folder or Path(config) / "epypes" / "keys"
+    if listed:
+        _print_keys(folder, name)
+        return
+    if not _NAME.fullmatch(name):
+        text = "Use letters, digits, - and _; --to names the folder: epypes keys camera --to keys"
+        raise KeysError(name, f"{name!r} is no name for keys. {text}")
+    made = make_keys(folder / name)
+    public, secret = folder / f"{name}.key", folder / f"{name}.key_secret"
+    click.echo(
+        f"Made the keys of {name}: {made.public}\n"
+        f"  {public}  is public: copy it to every machine that shall talk to {name},\n"
+        "    and name it there, or the folder it is in, as --allow.\n"
+        f"  {secret}  is secret: it stays here; name it here as --keys.\n"
+        f"A service and its caller: epypes serve BUNDLE --keys {secret} --allow CALLER.key, "
+        f"epypes call BUNDLE IMAGE --keys CALLER.key_secret --allow {public.name}"
+    )
+
+
+def _print_keys(folder: Path, name: str) -> None:
+    """Print the public keys in a folder, or the one of a name, and where the secret keys are."""
+    from epypes.transport.zeromq.curve import public_keys
+
+    files = [folder / f"{name}.key"] if name else sorted(folder.glob("*.key"))
+    if not files:
+        raise KeysError(folder, f"There are no keys in {folder}. Make some: epypes keys NAME --to {folder}")
+    rows = [(file.stem, *public_keys(file), _secret_state(file.with_name(f"{file.stem}.key_secret"))) for file in files]
+    columns = {name: {"overflow": "fold"} for name in ("name", "public key", "secret key")}
+    print_table(columns, rows, f"Public keys in {folder}")
+
+
+def _secret_state(file: Path) -> str:
+    if not file.exists():
+        return "elsewhere"
+    return "here" if file.stat().st_mode & 0o077 == 0 else f"others can read it: chmod 600 {file}"
 
 
 @click.command()
@@ -61,7 +114,10 @@ def export() -> None:
 @click.option("--to", type=PATH, help="File, or folder for it; default: standard output.")
 @click.option("--user", default=getpass.getuser, show_default="you", help="User that runs the service.")
 def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) -> None:
-    """Write a unit by which systemd starts the service at boot, and again when it ends."""
+    """Write a systemd unit for the service.
+
+    systemd then starts the service at boot, and restarts it when it ends.
+    """
     from epypes.service.ops.export import systemd_unit, unit_name
 
     _check_serve_options(bundle, options)
@@ -82,7 +138,10 @@ def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) ->
 @_serve_options
 @click.option("--to", type=PATH, required=True, help="Folder to write; it must not exist yet.")
 def docker(bundle: Path, options: Sequence[str], to: Path) -> None:
-    """Write a folder from which docker or podman builds the service: container file, requirements, bundle."""
+    """Write a build folder for docker or podman.
+
+    It has a container file, the requirements and the bundle.
+    """
     from epypes.service.ops.export import write_container
 
     _check_serve_options(bundle, options)
