@@ -8,8 +8,8 @@ and the state of the lists, arrays and objects that functions use. What can't be
 from __future__ import annotations
 
 import enum
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -20,7 +20,7 @@ from epypes.batch.items import Item
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
 from epypes.bundle.fingerprint import Digester, combined_digest, file_digest, versions_of
-from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
+from epypes.errors import EpypesError, PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array
@@ -62,20 +62,15 @@ class Fingerprint:
     reader: str
 
 
-def source_of(cg: CompGraph) -> str | None:
-    """Return a graph as the text that promotion writes; None if that is refused."""
-    try:
-        return to_source(cg)
-    except (SourceRefused, PlaceholderNeeded):
-        return None
-
-
 def graph_fingerprint(cg: CompGraph) -> Fingerprint:
     """Return the fingerprint of what a graph computes."""
     digester = Digester()
     digester.add(cg)
     # An object whose content can't be digested, as a detector of OpenCV, counts by the expression that makes it.
-    source = (source_of(cg) or "") if digester.unknown else ""
+    source = ""
+    if digester.unknown:
+        with suppress(SourceRefused, PlaceholderNeeded):
+            source = to_source(cg)
     code = combined_digest("graph", source, digester.code.digest(), *versions_of(digester.modules)).hex()
     state = combined_digest("state", digester.state.digest(), *versions_of(digester.state_modules)).hex()
     return Fingerprint(code, state, "" if source else digester.unknown, digester.reader)
@@ -154,6 +149,54 @@ def _is_short(value: Any) -> bool:
     return type(value) in _SHORT and not (type(value) is int and value.bit_length() > _SHOWN_CHARACTERS * 4)
 
 
+# -- searches -------------------------------------------------------------------------------------------------------
+
+
+def search_digests(
+    cg: CompGraph, metric: Any, data: Mapping[str, Callable[[], Any]], *, is_named: bool
+) -> dict[str, str]:
+    """Return digests of all that decides about the trials of a search, by what they are of.
+
+    Parameters
+    ----------
+    cg
+        The graph.
+    metric
+        The function that measures it; the name of a token is no part of this.
+    data
+        By what it is, what returns anything else that decides about trials.
+    is_named
+        Whether the user has given the search a name; what has no digest has "" then.
+
+    Raises
+    ------
+    ScaleError
+        Something has no digest, and the search no name.
+    """
+
+    def of_graph() -> str:
+        found = graph_fingerprint(cg)
+        if found.unknown or found.reader:
+            raise NoDigest(found.unknown or reader_text(found.reader))
+        return combined_digest("graph", found.code, found.state).hex()
+
+    ways: dict[str, Callable[[], str]] = {
+        "graph": of_graph,
+        "metric": lambda: "token" if isinstance(metric, str) else function_digest(metric),
+        **{what: lambda given=given: value_digest(given()) for what, given in data.items()},  # type: ignore[misc]
+    }
+    digests = {}
+    for what, way in ways.items():
+        try:
+            digests[what] = way()
+        except (EpypesError, NoDigest) as error:
+            if not is_named:
+                text = f"The search has no name for the store, and one can't be computed from its {what}: {error}"
+                raise ScaleError(f"{text}.\nGive one: name='...'.") from error
+            digests[what] = ""
+    return digests
+
+
 # -- series ---------------------------------------------------------------------------------------------------------
 
 
@@ -166,7 +209,7 @@ def outcome_cache(
     *,
     keep: Sequence[str] = (),
     show: Sequence[str] | None = (),
-    varied: Collection[str] = (),
+    settings: Sequence[Mapping[str, Any]],
 ) -> Iterator[OutcomeCache | None]:
     """Open the series of a runner's outcomes; what waits to be written is written at the end.
 
@@ -184,8 +227,8 @@ def outcome_cache(
         Tokens whose whole values are wanted. They are not in the store, so with one everything is run.
     show
         Tokens of which thumbnails are made.
-    varied
-        The hyperparameters of which each outcome has its own values.
+    settings
+        The hyperparameters of which each outcome has its own values, by token.
 
     Warns
     -----
@@ -203,12 +246,16 @@ def outcome_cache(
             yield None
             return
         found = graph_fingerprint(runner.cg)
-        series = _series_of(opened, kind, runner, name, varied, found)
+        fixed = {token: value for token, value in runner.hyperparameters.items() if token not in settings[0]}
+        about = {"graph": found.code, "hyperparameters": _hyperparameter_labels(fixed)}
+        own_name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
+        series = opened.series(kind, name or own_name, about=about)
+        _check_same(series, about)
         doubt = _doubt(found, has_name=bool(name))
         if doubt:
-            warn(doubt, stacklevel=4)
+            warn(doubt, stacklevel=5)
         shown = "" if show == () else f"show={show and list(show)}"
-        with OutcomeCache(series, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
+        with OutcomeCache(series, settings, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
             yield cache
 
 
@@ -221,17 +268,6 @@ def _doubt(found: Fingerprint, *, has_name: bool) -> str:
         text = f"The graph uses {reader_text(found.reader)}, which may have changed: every item is run again."
         return f"{text} To reuse what is stored, give name=, and another name once such a file or variable has changed."
     return ""
-
-
-def _series_of(
-    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str], found: Fingerprint
-) -> Series:
-    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
-    about = {"graph": found.code, "hyperparameters": _hyperparameter_labels(fixed)}
-    own_name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
-    series = store.series(kind, name or own_name, about=about)
-    _check_same(series, about)
-    return series
 
 
 def _hyperparameter_labels(values: Mapping[str, Any]) -> dict[str, str]:
@@ -258,6 +294,14 @@ def _check_same(series: Series, about: Mapping[str, Any]) -> None:
     )
 
 
+def _setting_label(setting: Mapping[str, Any]) -> str:
+    """Return the values of a setting as a part of a key; "" if one has no digest."""
+    try:
+        return repr({token: value_label(value) for token, value in setting.items()})
+    except NoDigest:
+        return ""
+
+
 class OutcomeCache:
     """The outcomes of a series; new ones are written a few at a time.
 
@@ -265,6 +309,8 @@ class OutcomeCache:
     ----------
     series
         The series.
+    settings
+        With which items are run.
     suffix
         What else than the item and its setting decides about an outcome.
     reads
@@ -275,42 +321,30 @@ class OutcomeCache:
     An item whose content can't be digested is run each time, and not written.
     """
 
-    def __init__(self, series: Series, suffix: str = "", *, reads: bool = True) -> None:
-        self._series, self._suffix = series, suffix
+    def __init__(
+        self, series: Series, settings: Sequence[Mapping[str, Any]], suffix: str = "", *, reads: bool = True
+    ) -> None:
+        self._series, self._settings, self._suffix = series, settings, suffix
         self._known = series.keys() if reads else frozenset()
+        self._labels = [_setting_label(setting) for setting in settings]
         self._keys: dict[tuple[int, int], str] = {}
-        # With the settings themselves, so that no other has the identity of one.
-        self._setting_labels: dict[int, tuple[Mapping[str, Any], str | None]] = {}
         self._waiting: list[tuple[str, dict[str, Any]]] = []
         self._written_s = monotonic()
 
-    def found(self, item: Item, settings: Iterable[Mapping[str, Any]]) -> list[Outcome | None]:
-        """Return the stored outcomes of an item under settings; None for those that have to be run."""
+    def found(self, item: Item) -> list[Outcome | None]:
+        """Return the stored outcomes of an item, by setting; None for those that have to be run."""
         try:
-            label = f"{item.name} {payload_digest(item.payload)} {self._suffix}"
+            of_item = f"{item.name} {payload_digest(item.payload)} {self._suffix}"
         except NoDigest:
-            return [None for _ in settings]
-        return [self._outcome(item, setting, label) for setting in settings]
-
-    def _outcome(self, item: Item, setting: Mapping[str, Any], of_item: str) -> Outcome | None:
-        of_setting = self._label_of_setting(setting)
-        if of_setting is None:
-            return None
-        key = f"{of_item} {of_setting}"
-        stored = self._series.get(key) if key in self._known else None
-        if stored is None:
-            self._keys[item.number, id(setting)] = key
-            return None
-        return Outcome.from_json(stored, item, setting)
-
-    def _label_of_setting(self, setting: Mapping[str, Any]) -> str | None:
-        if id(setting) not in self._setting_labels:
-            try:
-                label = repr({token: value_label(value) for token, value in setting.items()})
-            except NoDigest:
-                label = None
-            self._setting_labels[id(setting)] = setting, label
-        return self._setting_labels[id(setting)][1]
+            return [None for _ in self._settings]
+        outcomes: list[Outcome | None] = []
+        for setting, label in zip(self._settings, self._labels, strict=True):
+            key = f"{of_item} {label}"
+            stored = self._series.get(key) if label and key in self._known else None
+            outcomes.append(None if stored is None else Outcome.from_json(stored, item, setting))
+            if label and stored is None:
+                self._keys[item.number, id(setting)] = key
+        return outcomes
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes of items that had to be run."""

@@ -163,6 +163,8 @@ class Case:
     hyperparameters: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
+        if self.name is not None and not isinstance(self.name, str):
+            raise ScaleError(f"The name of a case is a text, not {self.name!r:.60}.")
         for part in ("expected", "metrics", "hyperparameters"):
             given = getattr(self, part)
             if given is not None and not isinstance(given, Mapping):
@@ -351,11 +353,9 @@ def _as_mapping(case: Case, name: str, spec: Any) -> Mapping[str, Any]:
 
 
 def _bound(case: Case, name: str, key: str, bound: Any) -> float | None:
-    if bound is None:
-        return None
-    if not _is_number(bound) or math.isnan(bound):
+    if bound is not None and (not _is_number(bound) or math.isnan(bound)):
         raise ScaleError(f"{key} of metric {name!r} of {case} is {bound!r:.40}, which is no number.")
-    return float(bound)
+    return None if bound is None else float(bound)
 
 
 def _is_number(value: Any) -> bool:
@@ -396,16 +396,26 @@ def _read_file(path: Path) -> list[Case]:
     ScaleError
         The file can't be read, or holds something else than cases; with every reason.
     """
-    text, document = _document(path)
-    unknown = [key for key in document if key != "case"]
-    reasons = [str(UnknownName("key", key, ("case",), f"in {path.name}")) for key in unknown]
+    if path.is_dir():
+        text = f"{str(path)!r} is a folder. Give the path of a CASES.toml, or a list of cases that say what is expected"
+        raise ScaleError(f"{text}: [ep.Case('{path.name}/a.png', expected={{...}}), ...].")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        document = tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise ScaleError(f"There is no file {str(path)!r}. Check the path.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ScaleError(f"{path} is not TOML: {error}.") from error
+    except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text
+        raise ScaleError(f"{str(path)!r} can't be read: {getattr(error, 'strerror', None) or error}.") from error
+    reasons = [str(UnknownName("key", key, ("case",), f"in {path.name}")) for key in document if key != "case"]
     tables = document.get("case")
     if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
         reasons.append(f"{path} has no cases. Write one: [[case]] with inputs and [[case.check]].")
         raise ScaleError(" ".join(reasons))
-    lines = [text.count("\n", 0, match.start()) + 1 for match in _CASE_HEADER.finditer(text)]
-    if len(lines) != len(tables):  # written as an inline array
-        lines = [1] * len(tables)
+    headers = [text.count("\n", 0, match.start()) + 1 for match in _CASE_HEADER.finditer(text)]
+    # There are none if the cases are written as an inline array.
+    lines = headers if len(headers) == len(tables) else [1] * len(tables)
     cases = []
     for table, line in zip(tables, lines, strict=True):
         try:
@@ -417,47 +427,22 @@ def _read_file(path: Path) -> list[Case]:
     return cases
 
 
-def _document(path: Path) -> tuple[str, dict[str, Any]]:
-    if path.is_dir():
-        text = f"{str(path)!r} is a folder. Give the path of a CASES.toml, or a list of cases that say what is expected"
-        raise ScaleError(f"{text}: [ep.Case('{path.name}/a.png', expected={{...}}), ...].")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        return text, tomllib.loads(text)
-    except FileNotFoundError as error:
-        raise ScaleError(f"There is no file {str(path)!r}. Check the path.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ScaleError(f"{path} is not TOML: {error}.") from error
-    except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ScaleError(f"{str(path)!r} can't be read: {reason}.") from error
-
-
 def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
-    name = table.get("name")
+    name, checks = table.get("name"), table.get("check", [])
     where = f"in case {name!r:.{_VALUE_CHARACTERS}}" if name else "in this case"
     for key in table:
         if key not in _CASE_KEYS:
             raise UnknownName("key", key, _CASE_KEYS, where)
-    if name is not None and not isinstance(name, str):
-        raise ValueError(f"The name of a case is a text, not {name!r:.{_VALUE_CHARACTERS}}.")
     if "inputs" not in table:
         raise ValueError(f'There are no inputs {where}. Write: inputs = {{image = "a.png"}}.')
-    checks, hyperparameters = table.get("check", []), table.get("hyperparameters", {})
     if not (isinstance(checks, list) and all(isinstance(check, Mapping) for check in checks)):
         raise ValueError(f"The checks {where} are tables: [[case.check]].")
-    if not isinstance(hyperparameters, Mapping):
-        raise ValueError(f"hyperparameters {where} is a table, not {hyperparameters!r:.{_VALUE_CHARACTERS}}.")
-    inputs = table["inputs"]
-    if isinstance(inputs, Mapping):
-        inputs = {token: _in_folder(value, folder) for token, value in inputs.items()}
     metrics: dict[str, Any] = {}
     expected: dict[str, Any] = {}
     taken: dict[str, int] = {}
     for check in checks:
         # Without a token it is the one sink token, whatever other checks of the case expect.
-        spec = {"token": None, **check}
-        spec.setdefault("metric", "equal" if "expected" in spec else "value")
+        spec = {"token": None, "metric": "equal" if "expected" in check else "value", **check}
         token = spec["token"]
         if "expected" in spec:
             spec["expected"] = _in_folder(spec["expected"], folder)
@@ -465,12 +450,16 @@ def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
                 expected.setdefault(token, spec["expected"])
         label = str(spec.pop("name", spec["metric"] if token is None else f"{spec['metric']} of {token}"))
         metrics[_unique(label, taken)] = spec
-    values = {token: _hyperparameter(token, entry) for token, entry in hyperparameters.items()}
-    return Case(_in_folder(inputs, folder), expected, metrics, name, values)
+    values = table.get("hyperparameters")
+    if isinstance(values, Mapping):
+        values = {token: _hyperparameter(token, entry) for token, entry in values.items()}
+    return Case(_in_folder(table["inputs"], folder), expected, metrics, name, values)
 
 
 def _in_folder(value: Any, folder: Path) -> Any:
-    """Return the path of what names a file, relative to that of the cases; any other value as it is."""
+    """Return the path of what names a file, relative to that of the cases, by token too; any other value as it is."""
+    if isinstance(value, Mapping):
+        return {token: _in_folder(item, folder) for token, item in value.items()}
     return folder / Path(value).expanduser() if is_file(value) else value
 
 

@@ -24,20 +24,10 @@ from epypes.batch.items import detached_runner, items_of, read_value
 from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import (
-    LEFT,
-    ErrorInfo,
-    Outcome,
-    Pictures,
-    Thumbnail,
-    frame_of,
-    html_row,
-    object_column,
-)
-from epypes.batch.thumbnails import DIFFERENCE_LEGEND, comparison_thumbnails
+from epypes.batch.results import ErrorInfo, Outcome, frame_of, html_table, object_column
+from epypes.batch.thumbnails import DIFFERENCE_LEGEND, Thumbnail, comparison_thumbnails
 from epypes.bundle.compare import first_difference
 from epypes.bundle.settings import Member
-from epypes.display.markup import content, fitted
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -298,7 +288,21 @@ class CheckResult:
         return f"<CheckResult: {counted(len(cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}>"
 
     def _repr_html_(self) -> str:
-        return _page(self)
+        kinds = ("expected", "got", "difference")
+        pictured = [kind for kind in kinds if any(kind in outcome.pictures for outcome in self.outcomes)]
+        rows = [
+            (
+                outcome.case,
+                outcome.check,
+                "" if outcome.value is None else f"{outcome.value:.6g}",
+                outcome.threshold,
+                *(outcome.pictures.get(kind) for kind in pictured),
+            )
+            for outcome in self.outcomes
+        ]
+        head, failures = ("case", "check", "value", "must be", *pictured), [one.reason for one in self.outcomes]
+        legend = f"<p>difference of masks: {DIFFERENCE_LEGEND}</p>" if "difference" in pictured else ""
+        return html_table(str(self), head, rows, failures) + legend
 
 
 # -- measuring --------------------------------------------------------------------------------------------------
@@ -453,36 +457,3 @@ def _junit(outcomes: Sequence[CheckOutcome], name: str) -> ET.Element:
 
 def _xml_text(text: str) -> str:
     return _NOT_XML.sub("\ufffd", text)
-
-
-# -- the page of a notebook -------------------------------------------------------------------------------------
-
-_MOST_ROWS: Final = 100
-_CELL_ROOM: Final = 100
-_REASON_ROOM: Final = 300
-# Colours that are read on a white and on a black ground; the mark and the text have the same meaning.
-_PASSED: Final = '<span style="color:#2e8b57">✓</span> passed'
-_FAILED: Final = '<b style="color:#d9482b">✗</b> <b>failed</b>'
-
-
-def _page(result: CheckResult) -> str:
-    """Return a table with a row per check, those that have not passed first, of at most about 120 kB."""
-    shown = sorted(result.outcomes, key=lambda outcome: outcome.passed)[:_MOST_ROWS]
-    pictured = [name for name in ("expected", "got", "difference") if any(name in one.pictures for one in shown)]
-    rows = [html_row("th", ["case", "check", "value", "must be", "passed", *pictured])]
-    pictures = Pictures()
-    for outcome in shown:
-        value = "" if outcome.value is None else f"{outcome.value:.6g}"
-        cells = [content(fitted(text, _CELL_ROOM)) for text in (outcome.case, outcome.check, value, outcome.threshold)]
-        reason = content(fitted(outcome.reason, _REASON_ROOM))
-        cells.append(_PASSED if outcome.passed else f"{_FAILED}<br>{reason}")
-        for name, picture in ((name, outcome.pictures.get(name)) for name in pictured):
-            alt = "" if picture is None else fitted(f"{name} of {outcome.case}: {picture.caption}", _CELL_ROOM)
-            cells.append(pictures.image(picture, alt))
-        rows.append(html_row("td", cells))
-    more = len(result.outcomes) - len(shown)
-    if more:
-        rows.append(html_row("td", [f"and {counted(more, 'check')} more"]))
-    caption = content(fitted(str(result), _REASON_ROOM))
-    legend = f"<p>difference of masks: {DIFFERENCE_LEGEND}</p>" if "difference" in pictured else ""
-    return f"<table><caption{LEFT}>{caption}</caption>{''.join(rows)}</table>{legend}"

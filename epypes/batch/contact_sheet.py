@@ -8,24 +8,22 @@ other pictures of a notebook: pictures become smaller first, then those at the e
 
 from __future__ import annotations
 
-import io
+import functools
 import math
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any, Final
+from pathlib import Path
+from typing import Final
 
 from epypes.batch.grid import identity
-from epypes.batch.results import Outcome, Thumbnail, data_uri
+from epypes.batch.results import Outcome, short_text
+from epypes.batch.thumbnails import Thumbnail, data_uri, smaller
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.display.markup import content, escape, fitted, size
-from epypes.display.previews.preview import sketch
-from epypes.display.previews.raster import encode_small
 from epypes.display.previews.short import reason
-from epypes.display.previews.shown import Look
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
-from epypes.optional import optional_import
 from epypes.wording import counted
 
 
@@ -227,11 +225,6 @@ def _tile(place: int, outcome: Outcome, label: str, shown: str | None) -> Tile:
     return Tile(place, label, text, False, thumbnail)
 
 
-def short_text(value: Any) -> str:
-    """Return a value in at most 30 characters."""
-    return sketch(value, Look()).shown.text
-
-
 def _pictured(cg: CompGraph, outcomes: Sequence[Outcome]) -> str | None:
     """Return the last sink token that has a picture, else the last token that has one; None without any."""
     pictured = frozenset[str]().union(*(outcome.thumbnails for outcome in outcomes))
@@ -262,8 +255,6 @@ def _require_shown(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> st
 
 # The number of tiles at most; fewer if their texts are long.
 _MOST_TILES: Final = (120, 80, 50, 25, 10, 3)
-# What a smaller picture shows is hardly seen.
-_LEAST_BYTES: Final = 400
 _ELEMENT_CHARACTERS: Final = 60
 _LABEL_ROOM: Final = 64
 _MESSAGE_ROOM: Final = 96
@@ -273,28 +264,11 @@ _SIDE_PX: Final = 128
 _MANY: Final = 40
 _SMALL_PX: Final = 80
 
-# Text has the colour of the page, lines and tints are mixed from it: readable on any ground.
-_STYLE: Final = (
-    "<style>.epypes-contact{--epypes-failed:var(--jp-error-color1,var(--vscode-errorForeground,#e5484d));"
-    "font:12px var(--jp-ui-font-family,system-ui,sans-serif);overflow-x:auto;scrollbar-width:thin}"
-    ".epypes-contact table{border-collapse:collapse;margin:0 0 10px;font-size:12px;width:auto}"
-    ".epypes-contact caption,.epypes-contact h4{text-align:left;font-size:12px;font-weight:600;margin:0;padding:4px 0;"
-    "color:inherit}"
-    ".epypes-contact tr{background:none!important}"
-    ".epypes-contact th{font-weight:600;text-align:center!important;padding:2px 6px;white-space:nowrap}"
-    ".epypes-contact .cell{box-sizing:border-box;width:calc(var(--side) + 8px);min-width:calc(var(--side) + 8px);"
-    "max-width:calc(var(--side) + 8px);height:var(--tall);padding:3px;text-align:center!important;"
-    "vertical-align:top;border:1px solid #8885;white-space:normal}"
-    ".epypes-contact div.cell{display:inline-block;height:auto;min-height:var(--tall);margin:0 4px 4px 0}"
-    ".epypes-contact img{display:block;margin:0 auto;width:var(--side);height:var(--side);max-width:none;"
-    "object-fit:contain}"
-    ".epypes-contact span{display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:7;overflow:hidden;"
-    "overflow-wrap:anywhere;line-height:1.3;margin-top:2px}"
-    ".epypes-contact b{color:var(--epypes-failed);color:color-mix(in srgb,var(--epypes-failed) 62%,currentColor)}"
-    ".epypes-contact .failed{outline:2px solid var(--epypes-failed);outline-offset:-2px;background:#e5484d22;"
-    "text-align:left!important}"
-    ".epypes-contact .chosen{outline:3px solid var(--jp-brand-color1,#1976d2);outline-offset:-2px}</style>"
-)
+
+@functools.cache
+def _style() -> str:
+    rules = (Path(__file__).parent / "contact_sheet.css").read_text(encoding="utf-8")
+    return f"<style>{' '.join(rules.split())}</style>"
 
 
 def sheet_page(sheet: Sheet, chosen: int | None = None) -> str:
@@ -324,7 +298,7 @@ def _page(sheet: Sheet, shown: Sheet, chosen: int | None) -> str:
     side_px = _SIDE_PX if pictures <= _MANY else _SMALL_PX
     # Tiles without pictures are no higher than their texts.
     sizes = f"--side:{side_px}px;--tall:{side_px + 8 if pictures else 0}px"
-    return f'<div class="epypes-contact" style="{sizes}">{"".join(parts)}{_STYLE}</div>'
+    return f'<div class="epypes-contact" style="{sizes}">{"".join(parts)}{_style()}</div>'
 
 
 def _paint_block(sheet: Sheet, block: Block, most_bytes: int, chosen: int | None) -> str:
@@ -367,18 +341,3 @@ def _paint_cell(tag: str, tiles: Cell, most_bytes: int, chosen: int | None) -> s
             alt = escape(fitted(tile.text, _LABEL_ROOM))
             painted += f'<img src="{data_uri(picture)}" alt="{alt}" title="{alt}">{label}'
     return f'<{tag} class="cell{state}">{painted}</{tag}>'
-
-
-def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:
-    """Return a picture within so many bytes; None if nothing would be seen on it."""
-    if len(thumbnail.data) <= most_bytes:
-        return thumbnail
-    if most_bytes < _LEAST_BYTES or thumbnail.media_type == "image/svg+xml":
-        return None
-    with optional_import("scale"):
-        from PIL import Image
-
-    with Image.open(io.BytesIO(thumbnail.data)) as opened:
-        opened.load()
-        encoded = encode_small(opened, most_bytes)
-    return replace(thumbnail, media_type=encoded.media_type, data=encoded.data)

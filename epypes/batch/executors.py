@@ -10,7 +10,7 @@ import os
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -24,11 +24,10 @@ from dataclasses import replace
 from typing import Any, Final
 
 from epypes.batch.items import payload_of
-from epypes.batch.job import Job, RunnerPool, run_job
+from epypes.batch.job import Job, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
     PackagedJob,
-    WorkerRefusal,
     known_package,
     package_of,
     packed_job,
@@ -40,6 +39,7 @@ from epypes.batch.results import ErrorInfo, Outcome
 from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ScaleError
 from epypes.run import CompGraphRunner
+from epypes.run.branch import branched
 from epypes.wording import counted, ended
 
 # How soon a stop is noticed while nothing comes, and a Ctrl+C that another thread was given, which does not wake a main
@@ -48,8 +48,6 @@ _LOOK_S: Final = 0.05
 _JOBS_PER_WORKER: Final = 2
 # How long a stop waits for the jobs that have begun.
 _GRACE_S: Final = 2.0
-# A larger package is sent to workers that ask for it, and not with every job.
-_MOST_SENT_BYTES: Final = 64_000
 
 
 def run_jobs(
@@ -86,14 +84,14 @@ def run_jobs(
     """
     if ahead is not None and (type(ahead) is not int or ahead < 1):
         raise ValueError(f"ahead is how many jobs are at work or waiting, 1 or more, not {ahead!r}.")
+    stop = stop or threading.Event()
     if executor is None:
         return _run_here(runner, jobs, stop)
     if not isinstance(executor, Executor):
         raise TypeError(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
-    over = threading.Event()
-    on_threads = isinstance(executor, ThreadPoolExecutor)
-    backend = _Threads(runner, executor, over, stop) if on_threads else _Processes(runner, executor)
-    return _run_in_flight(backend, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
+    most, over = ahead or _JOBS_PER_WORKER * worker_count(executor), threading.Event()
+    backend = _Threads(runner, executor, (stop, over)) if runs_here(executor) else _Processes(runner, executor)
+    return _run_in_flight(backend, jobs, most, over, stop)
 
 
 def runs_here(executor: Executor | None) -> bool:
@@ -101,12 +99,12 @@ def runs_here(executor: Executor | None) -> bool:
     return executor is None or isinstance(executor, ThreadPoolExecutor)
 
 
-def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
+def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
-    for job in jobs:
-        for outcome in () if stop is not None and stop.is_set() else run_job(own, job):
+    for job in () if stop.is_set() else jobs:
+        for outcome in run_job(own, job):
             yield [outcome]
-            if stop is not None and stop.is_set():
+            if stop.is_set():
                 return
 
 
@@ -126,7 +124,7 @@ class _WorkersKilled(Exception):
 
 
 def _run_in_flight(
-    backend: _Threads | _Processes, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
+    backend: _Threads | _Processes, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event
 ) -> Iterator[list[Outcome]]:
     """Keep so many jobs in flight; yield what comes; leave none behind, however it ends."""
     in_flight: dict[Future[Any], Job] = {}
@@ -135,7 +133,7 @@ def _run_in_flight(
     alone: Job | None = None
     source, done = iter(jobs), 0
     try:
-        while stop is None or not stop.is_set():
+        while not stop.is_set():
             while len(in_flight) < most and (job := next(source, None)) is not None:
                 in_flight[backend.submit(job)] = job
                 del job
@@ -240,33 +238,29 @@ class _Threads:
         Its graph and hyperparameters are used.
     executor
         The threads.
-    over
-        Once it is set, jobs that were begun end with the item that is being run.
-    stop
-        Once it is set, no job is begun any more.
+    stops
+        Once one of them is set, no job is begun any more, and jobs that were begun end with the item that is being run.
     """
 
-    def __init__(
-        self, runner: CompGraphRunner, executor: Executor, over: threading.Event, stop: threading.Event | None
-    ) -> None:
-        self._executor, self._over, self._stop = executor, over, stop
-        own = clone_runner(runner)
-        self._runners = RunnerPool(lambda: clone_runner(own))
+    def __init__(self, runner: CompGraphRunner, executor: Executor, stops: Sequence[threading.Event]) -> None:
+        self._runner, self._executor, self._stops = clone_runner(runner), executor, stops
 
     def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
         """Give a job to a thread."""
         return _submitted(self._executor, self._run, job)
 
     def _run(self, job: Job) -> list[Outcome]:
-        if self._stop is not None and self._stop.is_set():
-            return []
         outcomes: list[Outcome] = []
-        with self._runners.runner() as own:
-            for outcome in run_job(own, job):
+        if not self._is_stopped:
+            for outcome in run_job(branched(self._runner), job):
                 outcomes.append(outcome)
-                if self._over.is_set():
+                if self._is_stopped:
                     break
         return outcomes
+
+    @property
+    def _is_stopped(self) -> bool:
+        return any(stop.is_set() for stop in self._stops)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""
@@ -299,8 +293,8 @@ class _Processes:
             here: Future[Any] = Future()
             here.set_result(list(run_job(clone_runner(self._runner), job)))
             return here
-        if package.size > _MOST_SENT_BYTES and not with_files:
-            package = replace(package, files=None)
+        # A worker process that has not unpacked the package yet asks for its files.
+        package = package if with_files else replace(package, files=None)
         runner = self._runner
         options = runner.workers, runner.guard, runner.check_mutation
         packaged = PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed_job(job), *options)
@@ -326,11 +320,11 @@ class _Processes:
             if type(error).__name__ == "KilledWorker":
                 raise _WorkersKilled from error
             raise _job_error(error) from error
-        if not isinstance(found, WorkerRefusal):
-            return unpacked_outcomes(found, job)
-        if found.needs_files:
+        if found is None:
             raise _FilesMissing
-        raise ScaleError(found.reason)
+        if isinstance(found, str):
+            raise ScaleError(found)
+        return unpacked_outcomes(found, job)
 
 
 def _job_error(error: Exception) -> EpypesError:

@@ -1,29 +1,369 @@
-"""Grids of hyperparameter values: the settings that they stand for, and the order in which they run.
+"""Values of hyperparameters: the axes that a sweep or a search varies, and the grids of settings made of them.
 
-Settings are counted before any is written out, so that a grid which is too large costs nothing.
+A sweep and a search read ranges by one rule. Steps are counted and added in decimals, as they are written: 0.1 and two
+steps of 0.1 are 0.3, for a reader and for Optuna, which reads ranges that way too; sums of floats are
+0.30000000000000004. Settings are counted before any is written out, so that a grid which is too large costs nothing.
 """
 
 from __future__ import annotations
 
+import enum
 import math
+import numbers
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Sized
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
 from itertools import islice, pairwise, product
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from epypes.batch.ranges import axis_of, bounded, shares
-from epypes.catalog import range_of
+from epypes.catalog import parameter_names, plain, range_of
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph, as_switch
-from epypes.hints import Param, as_param
+from epypes.hints import Param, as_param, odd_step, param_from_value
+from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
 
 How = Literal["product", "zip", "random", "latin"]
 Setting = Mapping[str, Any]
 
 # More outcomes are too many to hold, and to look at.
 MOST_OUTCOMES: Final = 100_000
+# In steps: 2 / 3 is written a little smaller than it is, or larger, and three of them still end at 2.
+_SLACK: Final = Decimal("1e-9")
+
+
+# -- axes ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class NumberAxis:
+    """A hyperparameter that takes numbers from ``low`` to ``high``: integers if both ends and the step are.
+
+    Attributes
+    ----------
+    token
+        The hyperparameter.
+    low, high
+        The ends, both included.
+    step
+        The distance between two values; None for any number.
+    log
+        Whether small values are tried as often as large ones.
+    below
+        The hyperparameter whose value this one never exceeds, or empty.
+    """
+
+    token: str
+    low: float
+    high: float
+    step: float | None = None
+    log: bool = False
+    below: str = ""
+
+    @property
+    def size(self) -> int:
+        """The number of values; 0 if they can't be counted."""
+        if self.step is None:
+            return 0
+        return math.floor((_written(self.high) - _written(self.low)) / _written(self.step) + _SLACK) + 1
+
+    def values(self) -> Sequence[Any]:
+        """Return all values; if they are too many to hold, only a range of that length.
+
+        Raises
+        ------
+        ScaleError
+            They can't be counted.
+        """
+        if self.step is None:
+            low, high, token = f"{self.low:g}", f"{self.high:g}", self.token
+            raise ScaleError(
+                f"Between {low} and {high} there is no end of values for {token!r}. Give a list, as {token}=[...], a "
+                f"step, as ep.Param({low}, {high}, step=...), or how='random' with n=..."
+            )
+        return tuple(map(self._value, range(self.size))) if self.size <= MOST_OUTCOMES else range(self.size)
+
+    def at(self, share: float) -> float:
+        """Return the value at a share, from 0 to below 1, of the way from low to high."""
+        if self.log:
+            value = min(self.low * math.exp(share * math.log(self.high / self.low)), self.high)
+        elif self.step is not None:
+            return self._value(min(int(share * self.size), self.size - 1))
+        else:
+            value = self.low + share * (self.high - self.low)
+        return self.value(float(f"{value:.12g}"))
+
+    def value(self, suggested: float, rounded: Callable[[float], int] = round) -> float:
+        """Return the value of the axis that is nearest to a number; with ``math.floor`` the largest one up to it."""
+        if self.step is None:
+            return min(max(suggested, self.low), self.high)
+        place = rounded(round((suggested - self.low) / self.step, 9))
+        return self._value(min(max(place, 0), self.size - 1))
+
+    def suggestion(self, value: Any) -> float:
+        """Return what the sampler would have to suggest for a value, or for the nearest one."""
+        return self.value(plain(value))
+
+    @property
+    def distribution(self) -> BaseDistribution:
+        """The axis for Optuna, which has no steps on a logarithmic scale, nor any that end beside the range."""
+        from optuna.distributions import FloatDistribution, IntDistribution
+
+        low, high, step = self.low, self.high, None if self.log else self.step
+        if isinstance(low, int):
+            return IntDistribution(low, int(high), log=self.log, step=int(step or 1))
+        if step is not None and (_written(high) - _written(low)) % _written(step):
+            step = None
+        return FloatDistribution(low, high, log=self.log, step=step)
+
+    def _value(self, place: int) -> float:
+        """Return the value so many steps above the lowest one; ``high`` itself if that is as near as is written."""
+        low, high, step = _written(self.low), _written(self.high), _written(self.step or 0)
+        value = low + place * step
+        if isinstance(self.low, int):
+            return int(value)
+        return float(self.high if high - value < _SLACK * step else value)
+
+
+def _written(number: float) -> Decimal:
+    return Decimal(int(number)) if isinstance(number, numbers.Integral) else Decimal(repr(float(number)))
+
+
+@dataclass(frozen=True, slots=True)
+class ChoiceAxis:
+    """A hyperparameter that takes one of some values; each has a label of its own, for the database."""
+
+    token: str
+    choices: tuple[Any, ...]
+    labels: tuple[str, ...]
+
+    def at(self, share: float) -> Any:
+        """Return the value at a share from 0 to below 1."""
+        return self.choices[int(share * len(self.choices))]
+
+    def value(self, suggested: str) -> Any:
+        """Return the value of a label."""
+        return self.choices[self.labels.index(suggested)]
+
+    def suggestion(self, value: Any) -> str:
+        """Return the label of a value; the first label if the value is none of them."""
+        same = (label for label, known in zip(self.labels, self.choices, strict=True) if _is_one(known, value))
+        return next(same, self.labels[0])
+
+    @property
+    def distribution(self) -> BaseDistribution:
+        """The labels for Optuna."""
+        from optuna.distributions import CategoricalDistribution
+
+        return CategoricalDistribution(self.labels)
+
+
+Axis = NumberAxis | ChoiceAxis
+
+
+def _is_one(known: Any, value: Any) -> bool:
+    """Whether two values are one, whatever comparing them gives: 1 is not True."""
+    if isinstance(known, bool) != isinstance(value, bool):
+        return False
+    try:
+        return known is value or bool(known == value)
+    except Exception:  # arrays, for example
+        return False
+
+
+def axis_of(runner: CompGraphRunner, token: str, param: Param) -> Axis:
+    """Return the values that a hyperparameter may take; of a range its soft part, if it has one.
+
+    They are integers if the range is one of odd numbers, or if its ends and step are integers and the present value is
+    one, or no number: 1.0 is a float on purpose, and so is what it ranges over.
+
+    Raises
+    ------
+    ScaleError
+        An end is open, or there is no such number.
+    """
+    if param.choices is not None:
+        names = (one.name if isinstance(one, enum.Enum) else f"{one!r:.80}" for one in param.choices)
+        labels = tuple(param.labels or names)
+        if len(set(labels)) < len(labels):  # texts that are alike are numbered
+            labels = tuple(f"{text} #{number}" for number, text in enumerate(labels))
+        return ChoiceAxis(token, param.choices, labels)
+    return _number_axis(runner, token, param)
+
+
+def _number_axis(runner: CompGraphRunner, token: str, param: Param) -> NumberAxis:
+    low: Any
+    high: Any
+    low, high = param.soft or (param.low, param.high)
+    if not (_is_number(low) and _is_number(high)):
+        raise ScaleError(f"The range of {token!r} is open. Give both ends, as (low, high), or a list of values.")
+    step, present = param.step, plain(runner.hyperparameters[token])
+    given = (low, high, 1 if step is None else step)
+    is_whole = isinstance(present, numbers.Integral) or not isinstance(present, numbers.Real)
+    if param.odd:
+        low, high, step = math.ceil(low) | 1, math.floor(high), odd_step(step)
+        if low > high:
+            raise ScaleError(f"There is no odd number in the range of {token!r}. Widen it.")
+    elif is_whole and all(isinstance(number, numbers.Integral) for number in given):
+        low, high, step = int(low), int(high), int(step or 1)
+    else:
+        low, high, step = float(low), float(high), None if step is None else float(step)
+    axis = NumberAxis(token, low, high, step, param.log, _token_below(runner, token, param.below))
+    return axis if step is None else replace(axis, high=axis._value(axis.size - 1))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _require_branches(runner: CompGraphRunner, token: str, values: Iterable[Any]) -> None:
+    """Raise UnknownName, with the nearest name, unless the switches that a token selects have these branches."""
+    cg = runner.cg
+    for function in cg.digraph.consumers.get(token, ()):
+        switch = as_switch(cg.functions[function])
+        if switch is not None and cg.func_inputs(function)[0] == token:
+            for value in values:
+                switch.branch_index(value)
+
+
+def _token_below(runner: CompGraphRunner, token: str, name: str) -> str:
+    """Return the hyperparameter that a hint calls by its own name or by that of a function's parameter."""
+    if not name or name in runner.hyperparameters:
+        return name
+    cg = runner.cg
+    for function in cg.digraph.consumers.get(token, ()):
+        parameters = parameter_names(cg.functions[function])
+        for given, parameter in zip(cg.func_inputs(function), parameters, strict=False):
+            if parameter == name and given in runner.hyperparameters:
+                return given
+    return ""
+
+
+def bounded(axes: Sequence[Axis], values: Setting, present: Setting) -> dict[str, Any]:
+    """Return values of which none exceeds the one that it is to stay below.
+
+    Parameters
+    ----------
+    axes
+        What varies.
+    values
+        Of what varies, by token.
+    present
+        The values of the other hyperparameters.
+    """
+    kept = dict(values)
+    bounds = [axis for axis in axes if isinstance(axis, NumberAxis) and axis.below]
+    for _ in bounds:  # a bound may have one itself
+        for axis in bounds:
+            bound = kept.get(axis.below, present.get(axis.below))
+            if isinstance(bound, numbers.Real) and kept[axis.token] > bound:
+                kept[axis.token] = axis.value(float(bound), math.floor)
+    return kept
+
+
+# -- ranges as the caller gives them ------------------------------------------------------------------------------
+
+
+def _require_hyperparameter(runner: CompGraphRunner, name: Any) -> None:
+    """Raise, with the nearest name, unless a runner has this hyperparameter."""
+    known = tuple(runner.hyperparameters)
+    if name in known:
+        return
+    if name in runner.free_source_tokens:
+        raise ScaleError(f"{name!r} is a free source token, which images are given to. Freeze it, or give images=...")
+    raise UnknownName("hyperparameter", name, known)
+
+
+def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
+    """Return the range or the choices that are given for a hyperparameter; None stands for its hint."""
+    if given is None:
+        found = range_of(runner.cg, name, runner.hyperparameters[name])
+        if isinstance(found, Param):
+            return found
+        raise ScaleError(
+            f"No hint gives the values that {name!r} may take. Give a list of values, or a range, as (low, high)."
+        )
+    values = given
+    if hasattr(given, "tolist"):  # of numpy, as numbers of Python; of an array without axes the one that it holds
+        values = given.tolist()
+    elif isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping | tuple):
+        values = list(islice(given, MOST_OUTCOMES + 1))
+    try:
+        param = as_param(values)
+    except (TypeError, ValueError) as error:
+        raise ScaleError(f"{name}={given!r:.60}: {error}") from error
+    if not isinstance(param, Param):
+        raise ScaleError(
+            f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values. Write {name}=[...]."
+        )
+    _require_branches(runner, name, param.choices or ())
+    return param
+
+
+def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) -> tuple[Axis, ...]:
+    """Return what is searched, in graph order.
+
+    Parameters
+    ----------
+    runner
+        Its hyperparameters and their values are read.
+    ranges
+        By hyperparameter: an ``ep.Param``, a tuple as a range (low, high[, step]), or a list of choices; only these
+        vary. Without, all those vary for which an annotation, a switch, or the tables of OpenCV and scikit-image give
+        choices or both ends of a range, hard or usual. A range that is usual is widened to hold the present value.
+
+    Raises
+    ------
+    UnknownName
+        A range is for what is no hyperparameter of the runner.
+    ScaleError
+        A range can't be searched, or there is none.
+    """
+    present = runner.hyperparameters
+    if ranges is None:
+        found = tuple(_hinted_axes(runner))
+        if found:
+            return found
+        if not present:
+            raise ScaleError(
+                "The runner has no hyperparameters, so nothing can vary. Freeze some: runner.freeze(name=value)."
+            )
+        text = f"No hint gives a range for {', '.join(map(repr, present))}."
+        raise ScaleError(f"{text} Give some: ranges={{'name': (low, high)}}, or annotate the functions.")
+    if not ranges:
+        raise ScaleError('ranges is empty, so nothing would vary. Name hyperparameters: ranges={"name": (low, high)}.')
+    for token in ranges:
+        _require_hyperparameter(runner, token)
+    params = {token: _param(runner, token, ranges[token]) for token in runner.cg.source_tokens if token in ranges}
+    for token, param in params.items():
+        if param.choices is None and not _is_number(plain(present[token])):
+            text = f"{token!r} is {present[token]!r:.60}, so it has no range of numbers."
+            raise ScaleError(f"{text} Give a list of choices: ranges={{{token!r}: [...]}}.")
+    return tuple(axis_of(runner, token, param) for token, param in params.items())
+
+
+def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
+    for token in runner.cg.source_tokens:
+        if token not in runner.hyperparameters:
+            continue
+        value = runner.hyperparameters[token]
+        param = range_of(runner.cg, token, value)
+        if param is None and isinstance(value, bool | enum.Enum):
+            param = param_from_value(value)
+        if not isinstance(param, Param):
+            continue
+        if param.soft is not None:
+            low, high = param.soft
+            param = replace(param, low=min(low, plain(value)), high=max(high, plain(value)), soft=None)
+        if param.choices is not None or (_is_number(param.low) and _is_number(param.high)):
+            yield axis_of(runner, token, param)
+
+
+# -- grids --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +386,17 @@ class Grid:
 
     def require_room(self, images: int) -> None:
         """Raise ScaleError if the settings, each on so many images, are too many to hold."""
-        outcomes = self.size * images
-        if outcomes <= MOST_OUTCOMES:
-            return
-        each = f" on {images:,} images" if images != 1 else ""
-        raise ScaleError(
-            f"The grid has {self.size:,} settings of {', '.join(self.names)}{each}: {outcomes:,} outcomes, "
-            f"and at most {MOST_OUTCOMES:,} can be held. Take fewer values, or how='random' with n=..."
-        )
+        if self.size * images > MOST_OUTCOMES:
+            raise too_many_outcomes(self.size, self.names, images)
+
+
+def too_many_outcomes(size: int, names: Iterable[str], images: int) -> ScaleError:
+    """Return the error of a grid whose settings, each on so many images, are too many to hold."""
+    each = f" on {images:,} images" if images != 1 else ""
+    return ScaleError(
+        f"The grid has {size:,} settings of {', '.join(names)}{each}: {size * images:,} outcomes, "
+        f"and at most {MOST_OUTCOMES:,} can be held. Take fewer values, or how='random' with n=..."
+    )
 
 
 def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0) -> Grid:
@@ -66,33 +409,6 @@ def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int 
     UnknownName, HyperparameterError
         A name is not a hyperparameter of the runner.
     """
-    _require_how(how, n)
-    if _is_list_of(grid, Mapping):
-        return _listed(runner, grid)
-    axes = dict.fromkeys(grid) if _is_list_of(grid, str) else grid
-    if not isinstance(axes, Mapping) or not axes:
-        raise ScaleError(
-            f"grid is a mapping of hyperparameters to values, as {{'threshold': [50, 70]}}, not {grid!r:.60}."
-        )
-    for name in axes:
-        require_hyperparameter(runner, name)
-    if how in ("random", "latin"):
-        return _drawn(runner, axes, how, n or 0, seed)
-    values = {name: _values(runner, name, given) for name, given in axes.items()}
-    return _combined(runner, values, how)
-
-
-def require_hyperparameter(runner: CompGraphRunner, name: Any) -> None:
-    """Raise, with the nearest name, unless a runner has this hyperparameter."""
-    known = tuple(runner.hyperparameters)
-    if name in known:
-        return
-    if name in runner.free_source_tokens:
-        raise ScaleError(f"{name!r} is a free source token, which images are given to. Freeze it, or give images=...")
-    raise UnknownName("hyperparameter", name, known)
-
-
-def _require_how(how: str, n: int | None) -> None:
     if how not in get_args(How):
         raise UnknownName("way to read a grid", how, get_args(How), "for how=")
     is_drawn = how in ("random", "latin")
@@ -102,9 +418,16 @@ def _require_how(how: str, n: int | None) -> None:
         raise ScaleError(
             f"n={n!r} goes with how='random' or how='latin'. A {how} has as many settings as its values make."
         )
-
-
-# -- a list of settings ---------------------------------------------------------------------------------------------
+    if _is_list_of(grid, Mapping):
+        return _listed(runner, grid)
+    given = dict.fromkeys(grid) if _is_list_of(grid, str) else grid
+    if not isinstance(given, Mapping) or not given:
+        raise ScaleError(
+            f"grid is a mapping of hyperparameters to values, as {{'threshold': [50, 70]}}, not {grid!r:.60}."
+        )
+    for name in given:
+        _require_hyperparameter(runner, name)
+    return _drawn(runner, given, how, n or 0, seed) if is_drawn else _combined(runner, given, how)
 
 
 def _is_list_of(grid: Any, kind: type) -> bool:
@@ -112,60 +435,30 @@ def _is_list_of(grid: Any, kind: type) -> bool:
 
 
 def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
+    """Return the grid of settings that are taken as they are; what one leaves out is the runner's."""
     names = tuple(dict.fromkeys(name for setting in grid for name in setting))
     if not names:
         raise ScaleError("No setting of the grid names a hyperparameter. Give some, as [{'threshold': 50}, ...].")
     for name in names:
-        require_hyperparameter(runner, name)
+        _require_hyperparameter(runner, name)
         _require_branches(runner, name, [setting[name] for setting in grid if name in setting])
     now = {name: runner.hyperparameters[name] for name in names}
     return Grid(names, len(grid), lambda: tuple({**now, **setting} for setting in grid))
 
 
-# -- values by hyperparameter ---------------------------------------------------------------------------------------
-
-
-def _values(runner: CompGraphRunner, name: str, given: Any) -> Sequence[Any]:
-    """Return the values of one hyperparameter, sized, and not copied if they are."""
-    if given is None or isinstance(given, Param):
-        param = _hint(runner, name) if given is None else given
-        return axis_of(runner, name, param).values(MOST_OUTCOMES)
-    if isinstance(given, tuple):
-        listed = f"[{', '.join(map(repr, given[:4]))}{', ...' * (len(given) > 4)}]"
-        raise ScaleError(
-            f"{name}={given!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
-            f"for values between two ends how='random' with n=..."
-        )
-    if hasattr(given, "tolist"):
-        given = given.tolist()  # of numpy, as numbers of Python; of an array without axes the one that it holds
-    if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable):
-        raise ScaleError(f"{name}={given!r:.60} is no list of values. Write {name}=[{given!r:.60}, ...].")
-    values = _counted(given)
-    if not len(values):
-        raise ScaleError(f"{name} has no values. Give at least one, or leave it out of the grid.")
-    return values
-
-
-def _counted(given: Iterable[Any]) -> Sequence[Any]:
-    if isinstance(given, Sequence):
-        return given
-    if isinstance(given, Sized) and len(given) > MOST_OUTCOMES:
-        return range(len(given))  # to be counted, and refused
-    return tuple(islice(given, MOST_OUTCOMES + 1))
-
-
-def _hint(runner: CompGraphRunner, name: str) -> Param:
-    found = range_of(runner.cg, name, runner.hyperparameters[name])
-    if isinstance(found, Param):
-        return found
-    raise ScaleError(
-        f"No hint gives the values that {name!r} may take. Give a list of values, or a range, as (low, high)."
-    )
-
-
-def _combined(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]], how: str) -> Grid:
+def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Grid:
     """Return the grid of each value with each other, or of the first values of all, the second ones, and so on."""
-    lengths = {name: len(given) for name, given in values.items()}
+    values: dict[str, Sequence[Any]] = {}
+    for name, of_name in given.items():
+        if isinstance(of_name, tuple):
+            listed = f"[{', '.join(map(repr, of_name[:4]))}{', ...' * (len(of_name) > 4)}]"
+            raise ScaleError(
+                f"{name}={of_name!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
+                f"for values between two ends how='random' with n=..."
+            )
+        param = _param(runner, name, of_name)
+        values[name] = param.choices or _number_axis(runner, name, param).values()
+    lengths = {name: len(of_name) for name, of_name in values.items()}
     if how == "zip" and len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ScaleError(
@@ -173,56 +466,37 @@ def _combined(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]], how:
             "Give as many of each."
         )
     size = max(lengths.values()) if how == "zip" else math.prod(lengths.values())
-    if size <= MOST_OUTCOMES:
-        for name, given in values.items():
-            _require_branches(runner, name, given)
     combine: Callable[..., Iterable[tuple[Any, ...]]] = zip if how == "zip" else product
     return Grid(
         tuple(values), size, lambda: tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
     )
 
 
-def _require_branches(runner: CompGraphRunner, name: str, values: Iterable[Any]) -> None:
-    """Raise UnknownName, with the nearest name, unless the switches that a token selects have these branches."""
-    cg = runner.cg
-    for function in cg.digraph.consumers.get(name, ()):
-        switch = as_switch(cg.functions[function])
-        if switch is not None and cg.func_inputs(function)[0] == name:
-            for value in values:
-                switch.branch_index(value)
-
-
-# -- drawn by chance ------------------------------------------------------------------------------------------------
-
-
-def _drawn(runner: CompGraphRunner, grid: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
-    params = {name: _hint(runner, name) if given is None else _as_range(name, given) for name, given in grid.items()}
-    for name, param in params.items():
-        _require_branches(runner, name, param.choices or ())
-    axes = [axis_of(runner, name, param) for name, param in params.items()]
+def _drawn(runner: CompGraphRunner, given: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
+    """Return the grid of settings that are drawn: at random, or by Latin hypercubes, with each n-th part once."""
+    axes = [axis_of(runner, name, _param(runner, name, of_name)) for name, of_name in given.items()]
     present = runner.hyperparameters
 
     def settings() -> tuple[Setting, ...]:
-        rows = shares(how, n, len(axes), seed)
-        drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows)
+        import numpy as np
+
+        generator = np.random.default_rng(seed)
+        if how == "random":
+            rows = generator.random((n, len(axes)))
+        else:
+            with optional_import():
+                from scipy.stats import qmc
+            rows = qmc.LatinHypercube(len(axes), seed=generator).random(n)
+        drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows.tolist())
         return tuple(bounded(axes, setting, present) for setting in drawn)
 
-    return Grid(tuple(params), n, settings)
+    return Grid(tuple(given), n, settings)
 
 
-def _as_range(name: str, given: Any) -> Param:
-    if isinstance(given, range) or hasattr(given, "tolist"):
-        given = list(given) if isinstance(given, range) else given.tolist()
-    try:
-        param = as_param(given)
-    except ValueError as error:
-        raise ScaleError(f"{name}={given!r:.60}: {error}") from error
-    if not isinstance(param, Param):
-        raise ScaleError(f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values.")
-    return param
+# -- the order in which settings are run --------------------------------------------------------------------------
 
 
-def running_order(cg: CompGraph, settings: Sequence[Mapping[str, Any]]) -> list[int]:
+def running_order(cg: CompGraph, settings: Sequence[Setting]) -> list[int]:
     """Return the places of settings in the order in which they are best run.
 
     There is one at least. Each is run after the one before by running only what depends on what is different. So the
@@ -238,14 +512,14 @@ def running_order(cg: CompGraph, settings: Sequence[Mapping[str, Any]]) -> list[
     return sorted(range(len(settings)), key=rank)
 
 
-def steps(cg: CompGraph, settings: Sequence[Mapping[str, Any]]) -> list[int]:
+def steps(cg: CompGraph, settings: Sequence[Setting]) -> list[int]:
     """Return where, in running order, the hyperparameter that changes least often has a new value: 0, and others."""
     slowest = _slowest_first(cg, settings)[0]
     of_slowest = [identity(setting[slowest]) for setting in settings]
     return [0, *(place for place, (one, other) in enumerate(pairwise(of_slowest), 1) if one != other)]
 
 
-def _slowest_first(cg: CompGraph, settings: Sequence[Mapping[str, Any]]) -> list[str]:
+def _slowest_first(cg: CompGraph, settings: Sequence[Setting]) -> list[str]:
     return sorted(settings[0], key=lambda name: -len(functions_after(cg, name)))
 
 

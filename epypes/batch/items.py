@@ -40,7 +40,7 @@ class Item:
     payload: Mapping[str, Any]
 
 
-def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) -> Iterator[Item]:
+def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     """Yield the inputs of an image set, each when the caller wants the next one.
 
     Parameters
@@ -48,12 +48,10 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
     images
         A folder, a glob, one file, or an iterable of images (arrays), paths of image files, or dicts by free source
         token, in which a Path stands for an image file, and so does a text with the ending of an image, of ``.npy`` or
-        of ``.npz`` if there is such a file; any other text stands for itself.
+        of ``.npz`` if there is such a file; any other text stands for itself. What a generator gives is copied, since
+        it may be one array that is filled again each time.
     runner
         Its free source tokens are what an item has to give.
-    is_copied
-        Whether what a generator gives is copied, since it may be one array that is filled again each time. False if
-        the caller needs no item any more when it takes the next one.
 
     Raises
     ------
@@ -62,9 +60,11 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
     """
     free = runner.free_source_tokens
     if isinstance(images, str | Path):
-        return _of_files(*_files(images), _only(free, f"{str(images)!r} gives one image"))
+        files, root = _files(images)
+        token = _only(free, f"{str(images)!r} gives one image")
+        return iter([Item(number, _name(file, root), {token: file.absolute()}) for number, file in enumerate(files)])
     _check_set(images)
-    return _of_values(each_copied(images) if is_copied else images, type(images).__name__, free)
+    return _of_values(_each_copied(images), type(images).__name__, free)
 
 
 def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
@@ -101,13 +101,16 @@ def _files(images: str | Path) -> tuple[list[Path], Path]:
     path = Path(images).expanduser()
     if path.is_dir():
         files, root = image_files(path), path
-        looked_for = f"There are no images in folder {str(images)!r}: no file ends in {_endings()}."
+        looked_for = (
+            f"There are no images in folder {str(images)!r}: no file ends in {', '.join(sorted(IMAGE_ENDINGS))}."
+        )
     elif path.exists() or not any(mark in str(images) for mark in _SHOWN):
         files, root = ([path] if path.is_file() else []), path.parent
         looked_for = f"There is no folder or file {str(images)!r}. Check the path."
     else:
         found = (Path(name) for name in glob.glob(str(path), recursive=True))
-        files, root = sorted((file for file in found if file.is_file()), key=_place_and_name), _fixed_part(path)
+        files = sorted(filter(Path.is_file, found), key=lambda file: (str(file.parent), natural_order(file)))
+        root = _fixed_part(path)
         looked_for = (
             f"No file matches {str(images)!r}. Check the path; in a glob * stands for any text, ** for folders."
         )
@@ -116,25 +119,12 @@ def _files(images: str | Path) -> tuple[list[Path], Path]:
     return files, root
 
 
-def _place_and_name(file: Path) -> tuple[str, tuple[list[str | int], str]]:
-    return str(file.parent), natural_order(file)
-
-
 def _fixed_part(pattern: Path) -> Path:
     """Return the folder before the first part that has a mark in it."""
     fixed = pattern
     while any(mark in str(fixed) for mark in _SHOWN):
         fixed = fixed.parent
     return fixed
-
-
-def _endings() -> str:
-    return ", ".join(sorted(IMAGE_ENDINGS))
-
-
-def _of_files(files: list[Path], root: Path, token: str) -> Iterator[Item]:
-    for number, file in enumerate(files):
-        yield Item(number, _name(file, root), {token: file.absolute()})
 
 
 def _name(file: Path, root: Path) -> str:
@@ -270,7 +260,7 @@ def holds_its_arrays(values: Any) -> bool:
     return type(values) in (list, tuple) or is_array(values)
 
 
-def each_copied(values: Iterable[Any]) -> Iterator[Any]:
+def _each_copied(values: Iterable[Any]) -> Iterator[Any]:
     """Yield the values of an iterable, copied unless it holds its arrays itself."""
     if holds_its_arrays(values):
         yield from values

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import queue
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Final
 
 from epypes.batch.items import Item, payload_of
-from epypes.batch.results import ErrorInfo, Outcome, scalar
+from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
-from epypes.display.previews.preview import sketch
-from epypes.display.previews.shown import Look
 from epypes.errors import EpypesError
-from epypes.run import CompGraphRunner, Failure, Run
+from epypes.run import CompGraphRunner
 from epypes.run.branch import branched
 
 Setting = Mapping[str, Any]
@@ -63,88 +58,76 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     job
         The item and its settings. Of the second setting on only what depends on what changed is run.
     """
-    item, before = job.item, dict(runner.hyperparameters)
+    item, start, now = job.item, job.start or SharedStart(), runner.hyperparameters
     # A setting may leave out what another one has: that is then as it was.
-    varied = {token: before[token] for setting in job.settings for token in setting if token in before}
-    album = Album() if job.start is None else job.start.album
-    waiting, begun = deque(job.settings), list[Outcome]()
-
-    def outcome_of(own: CompGraphRunner, payload: Mapping[str, Any] | None) -> Outcome:
-        setting, start_ns = waiting.popleft(), perf_counter_ns()
-        run, error_info = _run(own, payload, {**varied, **setting}, job.targets)
-        if run is None:
-            return Outcome(
-                item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, error_info=error_info
-            )
-        return _outcome(item, setting, job, run, album)
+    varied = {token: now[token] for setting in job.settings for token in setting if token in now}
+    waiting, begun = iter(job.settings), list[Outcome]()
 
     def begin() -> CompGraphRunner | None:
+        """Run settings on the payload until there is a run, completed or failed; None if there is none."""
+        before = runner.last
         try:
             payload = payload_of(item, runner.cg)
         except (EpypesError, OSError) as error:
-            error_info = ErrorInfo("", type(error).__name__, str(error))
-            begun.extend(Outcome(item.number, item.name, setting, error_info=error_info) for setting in waiting)
-            waiting.clear()
+            info = ErrorInfo("", type(error).__name__, str(error))
+            begun.extend(Outcome(item.number, item.name, setting, error_info=info) for setting in waiting)
             return None
-        before = runner.last
-        while waiting and runner.last is before:
-            begun.append(outcome_of(runner, payload))
-        return None if runner.last is before else runner
+        for setting in waiting:
+            begun.append(_outcome(runner, job, setting, varied, payload, start.album))
+            if runner.last is not before:
+                return runner
+        return None
 
     try:
-        own = begin() if job.start is None else job.start.branch(begin)
+        own = begin() if job.start is None else start.branch(begin)
         yield from begun
-        while own is not None and waiting:
-            yield outcome_of(own, None)
-        if own is not None and job.start is not None:
-            job.start.move_to(own)
+        if own is not None:
+            for setting in waiting:
+                yield _outcome(own, job, setting, varied, None, start.album)
+            if job.start is not None:
+                start.move_to(own)
     finally:
-        runner.set(**varied)
+        if varied:
+            runner.set(**varied)
 
 
-def _run(
-    runner: CompGraphRunner, payload: Mapping[str, Any] | None, values: Setting, targets: tuple[str, ...]
-) -> tuple[Run | None, ErrorInfo | None]:
-    """Run on a payload, or on the last one; return the run, completed or failed, or why there is none."""
-    before = runner.last
+def _outcome(
+    runner: CompGraphRunner,
+    job: Job,
+    setting: Setting,
+    varied: Setting,
+    payload: Mapping[str, Any] | None,
+    album: Album,
+) -> Outcome:
+    """Run a job's item with a setting, on a payload or on the last one, and return what comes of it."""
+    item, values = job.item, {**varied, **setting}
+    before, start_ns = runner.last, perf_counter_ns()
     try:
         if payload is None:
-            return runner.rerun(*targets, **values), None
-        runner.set(**values)
-        return runner.run_on(payload, targets), None
+            run = runner.rerun(*job.targets, **values)
+        else:
+            if values:
+                runner.set(**values)
+            run = runner.run_on(payload, job.targets)
     except (Exception, SystemExit) as error:  # whatever a function raises
-        if runner.last is not before:
-            return runner.last, None
-        return None, ErrorInfo("", type(error).__name__, str(error))
-
-
-def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> Outcome:
-    report, tokens = run.report, run.tokens
+        if runner.last is None or runner.last is before:
+            info = ErrorInfo("", type(error).__name__, str(error))
+            return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, error_info=info)
+        run = runner.last
+    report, tokens, failure = run.report, run.tokens, run.failure
     thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
         item.number,
         item.name,
         setting,
-        {token: _value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
+        {token: short_value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
         report.durations_ns,
         report.total_ns,
-        None if run.failure is None else _error_info(run.failure),
+        None if failure is None else ErrorInfo(failure.function, failure.kind, failure.message),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
     )
-
-
-def _error_info(failure: Failure) -> ErrorInfo:
-    return ErrorInfo(failure.function, failure.kind, failure.message)
-
-
-def _value(value: Any) -> Any:
-    """Return a value as a table shows it."""
-    value = scalar(value)
-    if value is None or type(value) in (bool, int, float, str):
-        return value
-    return str(value) if isinstance(value, str) else sketch(value, Look()).shown.text
 
 
 class SharedStart:
@@ -189,29 +172,3 @@ class SharedStart:
         """Let the next job branch from this runner's last run."""
         with self._lock:
             self._runner = branched(runner)
-
-
-class RunnerPool:
-    """Runners for the threads of a pool, each used by one thread at a time.
-
-    Parameters
-    ----------
-    make
-        Returns a new runner; called when no runner is idle.
-    """
-
-    def __init__(self, make: Callable[[], CompGraphRunner]) -> None:
-        self._make = make
-        self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
-
-    @contextmanager
-    def runner(self) -> Iterator[CompGraphRunner]:
-        """Yield a runner that no other thread uses meanwhile."""
-        try:
-            own = self._idle.get_nowait()
-        except queue.Empty:
-            own = self._make()
-        try:
-            yield own
-        finally:
-            self._idle.put(own)

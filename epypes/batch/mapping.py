@@ -1,18 +1,21 @@
-"""Map: run a graph on each of many images."""
+"""Map: run a graph on each of many images; how items and settings become jobs, for sweeps too."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cache import OutcomeCache, outcome_cache
-from epypes.batch.executors import run_jobs
-from epypes.batch.items import Item, count_of, detached_runner, items_of
-from epypes.batch.job import NO_SETTING, Job, Setting
-from epypes.batch.progress import Advance, progress_bar
-from epypes.batch.results import Outcome, outcomes_frame, outcomes_html
+from epypes.batch.cache import outcome_cache
+from epypes.batch.executors import run_jobs, runs_here, worker_count
+from epypes.batch.grid import MOST_OUTCOMES, Setting, running_order, steps, too_many_outcomes
+from epypes.batch.items import count_of, detached_runner, items_of
+from epypes.batch.job import NO_SETTING, Job, SharedStart
+from epypes.batch.progress import progress_bar
+from epypes.batch.results import Outcome, OutcomeSequence, outcomes_frame, outcomes_html
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.store import Store
@@ -21,8 +24,14 @@ from epypes.wording import counted
 if TYPE_CHECKING:
     import pandas as pd
 
+# Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
+_PARTS: Final = 16
+_MOST_SETTINGS: Final = 256
+_UNITS: Final = {"map": "image", "sweep": "setting"}
 
-class MapResult(Sequence[Outcome]):
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MapResult(OutcomeSequence):
     """The results of a map: a sequence of outcomes in the order of the images, shown as a table.
 
     Attributes
@@ -33,15 +42,8 @@ class MapResult(Sequence[Outcome]):
         One per image.
     """
 
-    __slots__ = ("cg", "outcomes")
-
-    def __init__(self, cg: CompGraph, outcomes: Iterable[Outcome]) -> None:
-        self.cg, self.outcomes = cg, tuple(outcomes)
-
-    @property
-    def failures(self) -> tuple[Outcome, ...]:
-        """The outcomes of images that could not be read or on which a function failed."""
-        return tuple(outcome for outcome in self.outcomes if outcome.has_failed)
+    cg: CompGraph
+    outcomes: tuple[Outcome, ...]
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table: name, failure, the sink tokens, total_ms, and the time of each function in ms.
@@ -49,16 +51,6 @@ class MapResult(Sequence[Outcome]):
         Sink tokens that are no numbers, texts or truth values stand there as a short text.
         """
         return outcomes_frame(self.outcomes, self.cg)
-
-    @overload
-    def __getitem__(self, index: int) -> Outcome: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Outcome, ...]: ...
-    def __getitem__(self, index: int | slice) -> Outcome | tuple[Outcome, ...]:
-        return self.outcomes[index]
-
-    def __len__(self) -> int:
-        return len(self.outcomes)
 
     def __repr__(self) -> str:
         return f"<MapResult: {self._caption}>"
@@ -142,61 +134,95 @@ def map_images(
     >>> [outcome.values["brightness"] for outcome in result]
     [3.0, 7.0]
     """
-    for token in (*keep, *(show or ())):
-        runner.cg.require_token(token)
+    outcomes = run_items(
+        runner, images, (NO_SETTING,), executor,
+        kind="map", keep=keep, show=show, store=store, name=name, progress=progress, ahead=ahead,
+    )  # fmt: skip
+    return MapResult(runner.cg, outcomes)
+
+
+def run_items(
+    runner: CompGraphRunner,
+    images: Any,
+    settings: tuple[Setting, ...],
+    executor: Executor | None,
+    *,
+    kind: str,
+    keep: Sequence[str],
+    show: Sequence[str] | None,
+    store: str | Path | Store | None,
+    name: str | None,
+    progress: bool | None,
+    ahead: int | None = None,
+) -> tuple[Outcome, ...]:
+    """Return the outcomes of items under settings: item by item, in each in the order of its settings.
+
+    The parameters are those of ``map`` and ``sweep``; ``kind`` is ``"map"`` or ``"sweep"``.
+    """
     # If the caller changes hyperparameters meanwhile, that does not change what is computed and stored.
     runner = detached_runner(runner)
+    kept, shown = tokens_of(runner, keep), None if show is None else tokens_of(runner, show)
+    in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
+    # By object: a setting comes back as the very mapping that was sent.
+    places = {id(setting): place for place, setting in enumerate(settings)}
     count = count_of(images)
+    outcomes: list[Outcome] = []
     with (
-        outcome_cache(store, "map", runner, name, keep=keep, show=show) as cache,
-        progress_bar(progress, count, "map") as advance,
+        outcome_cache(store, kind, runner, name, keep=kept, show=shown, settings=in_order) as cache,
+        progress_bar(progress, count and count * len(settings), kind, unit=_UNITS[kind]) as advance,
     ):
-        collector = OutcomeCollector(cache, advance)
-        items = items_of(images, runner, is_copied=executor is not None or cache is not None or bool(keep))
-        shown = None if show is None else tuple(show)
-        jobs = (Job(item, keep=tuple(keep), show=shown) for item in collector.missing_items(items))
-        for outcomes in run_jobs(runner, jobs, executor, ahead=ahead):
-            collector.add(outcomes)
-    return MapResult(runner.cg, sorted(collector.outcomes, key=lambda outcome: outcome.number))
+
+        def take(found: list[Outcome]) -> None:
+            outcomes.extend(found)
+            advance(len(found), sum(outcome.has_failed for outcome in found))
+
+        def jobs() -> Iterator[Job]:
+            """Yield the jobs of each item: what is not stored, in parts, which in this process share the first run."""
+            for item in items_of(images, runner):
+                # How many a generator gives is known when it gives them; a map may be of any number.
+                if kind == "sweep" and (item.number + 1) * len(settings) > MOST_OUTCOMES:
+                    raise too_many_outcomes(len(settings), settings[0], item.number + 1)
+                missing = in_order
+                if cache is not None:
+                    stored = cache.found(item)
+                    take([outcome for outcome in stored if outcome is not None])
+                    missing = tuple(one for one, outcome in zip(in_order, stored, strict=True) if outcome is None)
+                parts = _parts(runner, missing, executor, count)
+                start = SharedStart() if len(parts) > 1 and runs_here(executor) else None
+                for part in parts:
+                    yield Job(item, part, kept, shown, start)
+                # This generator waits for its caller, and must not keep the item alive meanwhile.
+                del item, start
+
+        for found in run_jobs(runner, jobs(), executor, ahead=ahead):
+            if cache is not None:
+                cache.add(found)
+            take(found)
+    return tuple(sorted(outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
 
 
-class OutcomeCollector:
-    """The outcomes of a map or a sweep: those in the cache, and those that come from workers.
+def tokens_of(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the tokens that a caller names, one or several; UnknownName if the graph does not have one."""
+    tokens = (given,) if isinstance(given, str) else tuple(given)
+    for token in tokens:
+        runner.cg.require_token(token)
+    return tokens
 
-    Parameters
-    ----------
-    cache
-        What was stored before, and where new outcomes go; None for none.
-    advance
-        Moves the progress bar on.
-    """
 
-    def __init__(self, cache: OutcomeCache | None, advance: Advance) -> None:
-        self._cache, self._advance = cache, advance
-        self.outcomes: list[Outcome] = []
-
-    def missing_items(self, items: Iterable[Item]) -> Iterator[Item]:
-        """Yield the items that have to be run without a setting; take the stored outcomes of the others."""
-        for item in items:
-            if self.missing_settings(item, (NO_SETTING,)):
-                yield item
-            # This generator waits for its caller, and must not keep the item alive meanwhile.
-            del item
-
-    def missing_settings(self, item: Item, settings: tuple[Setting, ...]) -> tuple[Setting, ...]:
-        """Return the settings with which an item has to be run; take the stored outcomes of the others."""
-        if self._cache is None:
-            return settings
-        found = self._cache.found(item, settings)
-        self._take([outcome for outcome in found if outcome is not None])
-        return tuple(setting for setting, outcome in zip(settings, found, strict=True) if outcome is None)
-
-    def add(self, outcomes: list[Outcome]) -> None:
-        """Take outcomes that were computed, and store them."""
-        if self._cache is not None:
-            self._cache.add(outcomes)
-        self._take(outcomes)
-
-    def _take(self, outcomes: list[Outcome]) -> None:
-        self.outcomes += outcomes
-        self._advance(len(outcomes), sum(outcome.has_failed for outcome in outcomes))
+def _parts(
+    runner: CompGraphRunner, settings: tuple[Setting, ...], executor: Executor | None, count: int | None
+) -> list[tuple[Setting, ...]]:
+    """Cut the settings of an item into parts that several workers run at the same time."""
+    if executor is None or len(settings) < 2:
+        return [settings] if settings else []
+    workers = worker_count(executor)
+    # Outside of this process each part computes what all have in common: there are only as many as keep all
+    # workers at work.
+    parts = -(-workers // max(count or workers, 1))
+    parts *= _PARTS if parts > 1 and runs_here(executor) else 1
+    # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
+    places = steps(runner.cg, settings)
+    places = places if len(places) >= workers else list(range(len(settings)))
+    parts = min(max(parts, -(-len(settings) // _MOST_SETTINGS)), len(places))
+    cuts = [*(places[len(places) * part // parts] for part in range(parts)), len(settings)]
+    return [settings[first:end] for first, end in pairwise(cuts)]

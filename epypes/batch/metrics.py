@@ -14,6 +14,9 @@ from typing import Any, Final, Literal
 
 from epypes.optional import optional_import
 
+with optional_import("scale"):
+    import numpy as np
+
 BoxForm = Literal["xywh", "xyxy"]
 # Each label of one side is compared with each of the other; so many pairs take 0.2 GB.
 _MOST_PAIRS: Final = 25_000_000
@@ -62,8 +65,6 @@ def equal(value: Any, expected: Any) -> float:
     ValueError
         The shapes differ.
     """
-    import numpy as np
-
     if not (_is_array(value) and _is_array(expected)):
         return float(_is_same(value, expected))
     got, wanted = _pair(value, expected)
@@ -86,8 +87,6 @@ def close(value: Any, expected: Any, *, atol: float = 0.0, rtol: float = 1e-5) -
     ValueError
         The shapes differ, or these are no numbers.
     """
-    import numpy as np
-
     got, wanted = _numbers(value, expected)
     is_near = np.isclose(got, wanted, rtol=rtol, atol=atol, equal_nan=True)
     return float(np.mean(is_near)) if is_near.size else 1.0
@@ -113,8 +112,6 @@ def iou(value: Any, expected: Any, *, boxes: BoxForm = "xywh") -> float:
     ValueError
         The shapes differ, one is a mask and the other boxes, or there are too many labels to pair them.
     """
-    import numpy as np
-
     if boxes not in ("xywh", "xyxy"):
         raise ValueError(f"boxes is {boxes!r}, not 'xywh' or 'xyxy'.")
     if _is_boxes(value) and _is_boxes(expected):
@@ -143,8 +140,6 @@ def count(value: Any, *, of: Literal["items", "nonzero", "labels"] | None = None
     ValueError
         The value can't be counted, or in more than one way.
     """
-    import numpy as np
-
     if of == "nonzero":
         return float(np.count_nonzero(value))
     if of == "labels":
@@ -191,8 +186,6 @@ def mean_abs_difference(value: Any, expected: Any) -> float:
     ValueError
         The shapes differ, or these are no numbers.
     """
-    import numpy as np
-
     got, wanted = _numbers(value, expected)
     return float(np.mean(np.abs(got - wanted))) if got.size else 0.0
 
@@ -214,8 +207,6 @@ def psnr(value: Any, expected: Any, *, data_range: float | None = None) -> float
     ValueError
         The shapes or dtypes differ, or the range must be given.
     """
-    import numpy as np
-
     got, wanted = _pair(value, expected)
     if got.dtype != wanted.dtype:
         raise ValueError(f"The value is {got.dtype}, what was expected {wanted.dtype}. Give one dtype.")
@@ -279,8 +270,6 @@ def _is_boxes(value: Any) -> bool:
 
 def _boxes_iou(value: Any, expected: Any, form: BoxForm) -> float:
     """Return the IoU of boxes, paired one with one."""
-    import numpy as np
-
     got, wanted = (np.asarray(boxes, np.float64).reshape(-1, 4) for boxes in (value, expected))
     if form == "xywh":
         got, wanted = (np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]) for boxes in (got, wanted))
@@ -294,8 +283,6 @@ def _boxes_iou(value: Any, expected: Any, form: BoxForm) -> float:
 
 def _is_label_image(array: Any) -> bool:
     """Whether an array is a label image: integers with more than one value besides 0."""
-    import numpy as np
-
     if array.dtype.kind not in "iu":
         return False
     found = array[array != 0]
@@ -310,8 +297,6 @@ def _labels_iou(got: Any, wanted: Any) -> float:
     ValueError
         There are too many labels to compare each with each.
     """
-    import numpy as np
-
     (labels, ours), (other_labels, theirs) = (np.unique(array, return_inverse=True) for array in (got, wanted))
     rows, columns = len(labels), len(other_labels)
     if rows * columns > _MOST_PAIRS:
@@ -358,8 +343,6 @@ def _same_shape(value: Any, expected: Any) -> tuple[Any, Any]:
 
 
 def _numbers(value: Any, expected: Any) -> tuple[Any, Any]:
-    import numpy as np
-
     for array in map(_array, (value, expected)):
         if array.dtype.kind not in "biufc":
             raise ValueError(f"{_kind(array)} are no numbers.")
@@ -369,8 +352,6 @@ def _numbers(value: Any, expected: Any) -> tuple[Any, Any]:
 
 
 def _array(value: Any) -> Any:
-    import numpy as np
-
     try:
         return np.asarray(value)
     except ValueError as error:

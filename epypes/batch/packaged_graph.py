@@ -13,14 +13,13 @@ import re
 import socket
 import tempfile
 import threading
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
-from epypes.batch.cache import source_of
-from epypes.batch.job import Job, RunnerPool, run_job
+from epypes.batch.cache import graph_fingerprint
+from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
 from epypes.bundle.fingerprint import combined_digest
@@ -28,6 +27,7 @@ from epypes.bundle.load import SAMPLES, Bundle, read_bundle
 from epypes.bundle.settings import Unwritable, members_in, read, written
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
+from epypes.run.branch import branched
 from epypes.run.guard import is_plain_array
 from epypes.wire import Envelope, decode, encode
 from epypes.wording import ended
@@ -62,22 +62,15 @@ class PackagedGraph:
     files: Mapping[str, bytes] | None
     requirements: str = ""
 
-    @property
-    def size(self) -> int:
-        """How many bytes its files have."""
-        return sum(map(len, (self.files or {}).values()))
-
 
 # The packages that this process has made, by what they compute; the oldest ones go.
-_PACKAGES: Final[OrderedDict[str, PackagedGraph]] = OrderedDict()
-_LOCK: Final = threading.Lock()
+_PACKAGES: Final[dict[tuple[str, ...], PackagedGraph]] = {}
 
 
 def known_package(runner: CompGraphRunner) -> PackagedGraph | None:
     """Return the package of a runner's graph if this process has made it before."""
     key = _key_of(runner)
-    with _LOCK:
-        return None if key is None else _PACKAGES.get(key)
+    return None if key is None else _PACKAGES.get(key)
 
 
 def package_of(runner: CompGraphRunner) -> PackagedGraph:
@@ -103,10 +96,8 @@ def package_of(runner: CompGraphRunner) -> PackagedGraph:
     digest = combined_digest(*(part for file in files.items() for part in file)).hex()
     package = PackagedGraph(digest, files, files.get("requirements.txt", b"").decode())
     if (key := _key_of(runner)) is not None:
-        with _LOCK:
-            _PACKAGES[key] = package
-            while len(_PACKAGES) > _MOST_PACKAGES:
-                _PACKAGES.popitem(last=False)
+        _PACKAGES[key] = package
+        _drop_oldest(_PACKAGES, _MOST_PACKAGES)
     return package
 
 
@@ -123,17 +114,19 @@ def _reasons(reasons: Sequence[str], folder: Path) -> list[str]:
     return [*first, *texts]
 
 
-def _key_of(runner: CompGraphRunner) -> str | None:
-    """Return a text that differs for graphs that compute something else; None if the graph can't be written as text.
+def _drop_oldest(kept: dict[Any, Any], most: int) -> None:
+    for key in list(kept)[:-most]:
+        kept.pop(key, None)
+
+
+def _key_of(runner: CompGraphRunner) -> tuple[str, ...] | None:
+    """Return what differs for graphs that compute something else; None if nothing says so.
 
     Values of hyperparameters are not in it: they travel beside the package.
     """
-    source, cg = source_of(runner.cg), runner.cg
-    types = {
-        token: f"{type(value).__module__}.{type(value).__qualname__}" for token, value in runner.hyperparameters.items()
-    }
-    io = {name: (cg.func_inputs(name), cg.func_outputs(name)) for name in cg.functions}
-    return None if source is None else repr((source, io, types, runner.free_source_tokens))
+    found = graph_fingerprint(runner.cg)
+    types = (f"{token} {type(value)}" for token, value in runner.hyperparameters.items())
+    return None if found.unknown else (found.code, found.state, *runner.free_source_tokens, *types)
 
 
 # -- serialization --------------------------------------------------------------------------------------------------
@@ -257,53 +250,40 @@ class PackagedJob:
         return self.id
 
 
-@dataclass(frozen=True, slots=True)
-class WorkerRefusal:
-    """Why a worker process can't run a job; ``needs_files``: it has not unpacked the package yet."""
-
-    reason: str
-    needs_files: bool = False
-
-
-class _LoadedGraph:
-    """A bundle that was unpacked in this process, and the runners of it that are idle."""
-
-    def __init__(self, bundle: Bundle, packaged: PackagedJob) -> None:
-        self._enums = bundle.enums
-        values = unpacked_values(packaged.hyperparameters, bundle.enums)
-        options = {name: getattr(packaged, name) for name in ("workers", "guard", "check_mutation")}
-        self._runners = RunnerPool(lambda: CompGraphRunner(bundle.cg, values, **options))
-
-    def run(self, packaged: PackagedJob) -> list[Outcome]:
-        """Run a job, on a runner that no other thread uses meanwhile."""
-        with self._runners.runner() as own:
-            own.set(**unpacked_values(packaged.hyperparameters, self._enums))
-            return list(run_job(own, unpacked_job(packaged.job, self._enums)))
-
-
-_LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _LoadedGraph]] = OrderedDict()
+# By package and options: the members of the bundle's enumerations, and a runner that each job branches from.
+_LOADED: Final[dict[tuple[str, int, bool, bool], tuple[Mapping[str, Any], CompGraphRunner]]] = {}
 _LOAD_LOCK: Final = threading.Lock()
 
 
-def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | WorkerRefusal:
-    """Run a job in this worker process; the executor calls it."""
+def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
+    """Run a job in this worker process; the executor calls it.
+
+    Returns
+    -------
+    list, str or None
+        The outcomes, packed; or why this process can't run the job; None if it has not unpacked the package yet, and
+        the files have not come with the job.
+    """
     key = packaged.package.digest, packaged.workers, packaged.guard, packaged.check_mutation
     with _LOAD_LOCK:
-        loaded = _LOADED.get(key)
-        if loaded is None:
+        if key not in _LOADED:
             if packaged.package.files is None:
-                return WorkerRefusal("the files of the bundle are missing", needs_files=True)
+                return None
             try:
-                loaded = _LoadedGraph(_unpacked(packaged.package.files), packaged)
+                bundle = _unpacked(packaged.package.files)
+                values = unpacked_values(packaged.hyperparameters, bundle.enums)
+                options = {name: getattr(packaged, name) for name in ("workers", "guard", "check_mutation")}
+                _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **options)
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
-                return WorkerRefusal(_load_error(packaged.package, error))
-            _LOADED[key] = loaded
-            while len(_LOADED) > _MOST_LOADED:
-                _LOADED.popitem(last=False)
+                return _load_error(packaged.package, error)
+            _drop_oldest(_LOADED, _MOST_LOADED)
+        enums, runner = _LOADED[key]
+    own = branched(runner)
+    own.set(**unpacked_values(packaged.hyperparameters, enums))
     try:
-        return [packed_outcome(outcome) for outcome in loaded.run(packaged)]
+        return [packed_outcome(outcome) for outcome in run_job(own, unpacked_job(packaged.job, enums))]
     except ScaleError as error:
-        return WorkerRefusal(str(error))
+        return str(error)
 
 
 def _unpacked(files: Mapping[str, bytes]) -> Bundle:

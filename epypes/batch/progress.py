@@ -1,4 +1,4 @@
-"""Progress bars, on standard error or as text below a cell."""
+"""Progress bars: lines of text on standard error, no widgets, so that a saved notebook shows how they ended."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any, Final
 
 from epypes.optional import optional_import
 
@@ -16,7 +15,7 @@ Advance = Callable[[int, int], None]
 
 @contextmanager
 def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: str = "image") -> Iterator[Advance]:
-    """Show a bar on standard error, or below the cell of a notebook, and yield what moves it on.
+    """Show a bar on standard error, which a notebook shows below the cell, and yield what moves it on.
 
     Parameters
     ----------
@@ -36,7 +35,7 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
     with optional_import():
         from tqdm import tqdm
     failed = 0
-    with tqdm(total=total, desc=what, unit=unit, file=_Cell() if _is_in_notebook() else sys.stderr) as bar:
+    with tqdm(total=total, desc=what, unit=unit, file=sys.stderr) as bar:
 
         def advance(count: int, failures: int) -> None:
             nonlocal failed
@@ -48,39 +47,7 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
         yield advance
 
 
-class _Cell:
-    """A file below a cell of a notebook, of which the last line is seen.
-
-    Text, and no widget: a saved notebook shows how it ended, without a kernel.
-    """
-
-    # So that the bar is drawn in blocks.
-    encoding: Final = "utf-8"
-
-    def __init__(self) -> None:
-        self._shown: Any = None
-
-    def write(self, text: str) -> None:
-        """Show a line in the place of the one before."""
-        import IPython.display
-
-        line = {"text/plain": text.strip()}
-        if not line["text/plain"]:
-            return
-        if self._shown is None:
-            self._shown = IPython.display.display(line, raw=True, display_id=True)
-        else:
-            self._shown.update(line, raw=True)
-
-    def flush(self) -> None:
-        """Do nothing: each line is shown at once."""
-
-
 def _is_seen() -> bool:
-    return sys.stderr is not None and (sys.stderr.isatty() or _is_in_notebook())
-
-
-def _is_in_notebook() -> bool:
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
-    return getattr(shell, "kernel", None) is not None
+    return sys.stderr is not None and (sys.stderr.isatty() or getattr(shell, "kernel", None) is not None)

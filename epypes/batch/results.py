@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, overload
 
 from epypes.batch.items import Item
+from epypes.batch.thumbnails import Thumbnail, data_uri
 from epypes.display.durations import duration_text
-from epypes.display.markup import content, escape
+from epypes.display.markup import content, escape, fitted
+from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import float_text
+from epypes.display.previews.shown import Look
 from epypes.errors import ImageFileError, ScaleError
 from epypes.graph import CompGraph
 from epypes.optional import optional_import
@@ -51,25 +57,6 @@ class ErrorInfo:
     def __str__(self) -> str:
         where = f"{self.function}: " if self.function else ""
         return f"{where}{self.kind}{': ' + self.message if self.message else ''}"
-
-
-@dataclass(frozen=True, slots=True)
-class Thumbnail:
-    """A small picture of a token's value.
-
-    Attributes
-    ----------
-    media_type
-        ``"image/jpeg"``, ``"image/png"`` or ``"image/svg+xml"``.
-    data
-        The bytes of such a file.
-    caption
-        What it is of, as ``"uint8 400 x 600"``.
-    """
-
-    media_type: str
-    data: bytes
-    caption: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,46 +108,67 @@ class Outcome:
             for token, shown in self.thumbnails.items()
         }
         return {
-            "number": self.number,
-            "name": self.name,
-            "setting": {token: _json_value(value) for token, value in self.setting.items()},
-            "values": dict(self.values),
+            **{part.name: getattr(self, part.name) for part in fields(self) if part.name != "kept"},
+            "setting": {token: short_value(value) for token, value in self.setting.items()},
             "times_ns": dict(self.times_ns),
-            "total_ns": self.total_ns,
             "error_info": None if self.error_info is None else asdict(self.error_info),
             "thumbnails": thumbnails,
-            "texts": dict(self.texts),
         }
 
     @staticmethod
     def from_json(data: Mapping[str, Any], item: Item, setting: Mapping[str, Any]) -> Outcome:
         """Return the outcome that ``to_json`` wrote, for the item and the setting that it was looked up for."""
         info = data["error_info"]
-        return Outcome(
-            item.number,
-            item.name,
-            setting,
-            dict(data["values"]),
-            dict(data["times_ns"]),
-            data["total_ns"],
-            None if info is None else ErrorInfo(**info),
-            {
-                token: Thumbnail(**{**shown, "data": base64.b64decode(shown["data"])})
-                for token, shown in data["thumbnails"].items()
-            },
-            texts=dict(data["texts"]),
-        )
+        thumbnails = {
+            token: Thumbnail(**{**shown, "data": base64.b64decode(shown["data"])})
+            for token, shown in data["thumbnails"].items()
+        }
+        found = {
+            "number": item.number,
+            "name": item.name,
+            "setting": setting,
+            "error_info": None if info is None else ErrorInfo(**info),
+            "thumbnails": thumbnails,
+        }
+        return Outcome(**{**data, **found})
 
 
-def _json_value(value: Any) -> Any:
-    """Return a value of a setting as JSON; it is not read back."""
-    value = scalar(value)
-    if value is None or isinstance(value, bool | int | float | str):
+class OutcomeSequence(Sequence[Outcome]):
+    """The outcomes of a map or a sweep; ``outcomes`` has them as a tuple."""
+
+    __slots__ = ()
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def failures(self) -> tuple[Outcome, ...]:
+        """The outcomes of what could not be read or on which a function failed."""
+        return tuple(outcome for outcome in self.outcomes if outcome.has_failed)
+
+    @overload
+    def __getitem__(self, index: int) -> Outcome: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Outcome, ...]: ...
+    def __getitem__(self, index: int | slice) -> Outcome | tuple[Outcome, ...]:
+        return self.outcomes[index]
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
+
+
+def short_value(value: Any) -> Any:
+    """Return a number, text or truth value as it is, and of anything else a short text."""
+    value = _scalar(value)
+    if value is None or type(value) in (bool, int, float, str):
         return value
-    return [_json_value(item) for item in value] if isinstance(value, tuple | list) else str(value)
+    return str(value) if isinstance(value, str) else short_text(value)
 
 
-def scalar(value: Any) -> Any:
+def short_text(value: Any) -> str:
+    """Return a value in at most 30 characters."""
+    return sketch(value, Look()).shown.text
+
+
+def _scalar(value: Any) -> Any:
     """Return a number or truth value of numpy as Python's, and a very long number as text; anything else as it is."""
     if isinstance(value, int) and value.bit_length() > _MOST_BITS:
         return f"int of {value.bit_length():,} bits"
@@ -174,7 +182,7 @@ FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 def outcomes_frame(
-    outcomes: Sequence[Outcome], cg: CompGraph | None = None, extra: Mapping[str, Sequence[Any]] | None = None
+    outcomes: Sequence[Outcome], cg: CompGraph, extra: Mapping[str, Sequence[Any]] = MappingProxyType({})
 ) -> pd.DataFrame:
     """Return a table with one row per outcome.
 
@@ -183,7 +191,7 @@ def outcomes_frame(
     outcomes
         The rows.
     cg
-        Gives the order of sink tokens and functions; without, it is the one in which outcomes have them.
+        The graph, which gives the order of sink tokens and functions.
     extra
         Columns by name, each with a value per outcome; they stand after ``name``.
 
@@ -193,21 +201,19 @@ def outcomes_frame(
         ``name``, the extra columns, ``failure`` (None, or what failed), one column per sink token, ``total_ms``, and
         ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
     """
-    columns: dict[str, Sequence[Any]] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= {column: object_column(values) for column, values in (extra or {}).items()}
+    columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
+    columns |= {column: object_column(values) for column, values in extra.items()}
     columns["failure"] = object_column(
         [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
     )
-    tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
-    functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
-    for token in tokens:
+    for token in cg.sink_tokens:
         is_taken = token in columns or token in FIXED_COLUMNS
         columns[f"{token} (token)" if is_taken else token] = _column(
             [outcome.values.get(token) for outcome in outcomes]
         )
     columns["total_ms"] = [outcome.total_ns / 1e6 for outcome in outcomes]
-    for function in functions:
-        columns[f"{function} ms"] = [_in_ms(outcome.times_ns.get(function)) for outcome in outcomes]
+    for function in cg.functions:
+        columns[f"{function} ms"] = [outcome.times_ns.get(function, math.nan) / 1e6 for outcome in outcomes]
     return frame_of(columns)
 
 
@@ -221,113 +227,103 @@ def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
 def _column(values: list[Any]) -> Any:
     """Return values as a column; integers and truth values of which some are missing stay what they are."""
     kinds = {type(value) for value in values if value is not None}
-    if None in values and len(kinds) == 1 and kinds <= {bool, int}:
+    if None in values and kinds in ({bool}, {int}):
         with optional_import():
             import pandas as pd
-        try:
+        with suppress(OverflowError):  # above 64 bits
             return pd.array(values, dtype="boolean" if bool in kinds else "Int64")
-        except OverflowError:  # above 64 bits
-            return values
     return values
 
 
 def object_column(values: Sequence[Any]) -> Any:
     """Return values as a column; where None is one of them it stays None, since NaN is another value."""
-    has_none = any(value is None for value in values)
-    if not has_none:
+    if not any(value is None for value in values):
         return values
     with optional_import():
         import pandas as pd
     return pd.Series(list(values), dtype=object)
 
 
-def _in_ms(duration_ns: int | None) -> float:
-    return float("nan") if duration_ns is None else duration_ns / 1e6
+# -- tables as HTML -----------------------------------------------------------------------------------------------
+
+_MOST_ROWS: Final = 100
+_ROOM_OF_PICTURES: Final = 80_000
+_CELL_ROOM: Final = 100
+_FAILURE_ROOM: Final = 300
+_LEFT: Final = ' style="text-align:left"'
+# A red that is read on a white and on a black ground; the mark has the same meaning.
+_FAILED: Final = ' style="text-align:left;color:var(--jp-error-color1,var(--vscode-errorForeground,#d9482b))"'
+HtmlCell = str | Thumbnail | None
 
 
-def _all(found: Iterable[Mapping[str, Any]], first: Iterable[str]) -> list[str]:
-    """Return the names in all mappings: those of ``first`` in that order, then the others as they come."""
-    order = dict.fromkeys(first)
-    for names in found:
-        order |= dict.fromkeys(names)
-    return list(order)
+def html_table(
+    caption: str,
+    head: Sequence[str],
+    rows: Sequence[Sequence[HtmlCell]],
+    failures: Sequence[str] = (),
+    *,
+    most: int = _MOST_ROWS,
+) -> str:
+    """Return a table of texts and pictures as HTML, with as many pictures as there is room for.
+
+    Parameters
+    ----------
+    caption, head
+        Texts; a picture is described by its column and the first cell of its row.
+    rows
+        A cell per column.
+    failures
+        By row, what failed; empty texts where nothing did. These rows come first, and have one more column.
+    most
+        How many rows are shown.
+    """
+    reasons = failures if any(failures) else [""] * len(rows)
+    order = sorted(range(len(rows)), key=lambda place: not reasons[place])
+    titles = [*head, *(["failure"] if any(failures) else [])]
+    lines = [f"<tr>{''.join(f'<th{_LEFT}>{content(title)}</th>' for title in titles)}</tr>"]
+    room = _ROOM_OF_PICTURES
+    for place in order[:most]:
+        painted = ""
+        for title, cell in zip(head, rows[place], strict=True):
+            element = _html_cell(cell, f"{title} of {rows[place][0]}")
+            if isinstance(cell, Thumbnail):
+                element = element if len(element) <= room else ""
+                room -= len(element)
+            painted += f"<td{_LEFT}>{element}</td>"
+        if any(failures):
+            reason = reasons[place]
+            painted += f"<td{_FAILED}>\u2717 {content(fitted(reason, _FAILURE_ROOM))}</td>" if reason else "<td></td>"
+        lines.append(f"<tr>{painted}</tr>")
+    above = f"<caption{_LEFT}>{content(fitted(caption, _FAILURE_ROOM))}</caption>" if caption else ""
+    more = f"<p>and {len(rows) - most} more: to_frame() has all of them</p>" if len(rows) > most else ""
+    return f"<table>{above}{''.join(lines)}</table>{more}"
 
 
-_MOST_ROWS: Final = 30
-_THUMBNAIL_CHARACTERS: Final = 80_000
-_MESSAGE_CHARACTERS: Final = 160
-_ERROR: Final = "var(--jp-error-color1,var(--vscode-errorForeground,#cf222e))"
-LEFT: Final = ' style="text-align:left"'
+def _html_cell(cell: HtmlCell, what: str) -> str:
+    if isinstance(cell, Thumbnail):
+        alt = escape(fitted(f"{what}: {cell.caption}", _CELL_ROOM))
+        return f'<img src="{data_uri(cell)}" alt="{alt}" title="{alt}">'
+    return content(fitted(cell or "", _CELL_ROOM))
 
 
 def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
-    """Return a table as HTML: the failed and the first others, in order, with the thumbnails there is room for."""
-    chosen = _chosen(outcomes)
-    shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in chosen)]
+    """Return a table of outcomes as HTML, with their thumbnails."""
+    shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in outcomes)]
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
-    head = html_row("th", ["name", *shown, *sinks, "time"])
-    pictures = Pictures()
     rows = [
-        _outcome_row(outcome, [pictures.image(outcome.thumbnails.get(token)) for token in shown], sinks)
-        for outcome in chosen
+        [
+            outcome.name,
+            *(outcome.thumbnails.get(token) for token in shown),
+            *(value_text(outcome.values[token]) if token in outcome.values else "" for token in sinks),
+            duration_text(outcome.total_ns),
+        ]
+        for outcome in outcomes
     ]
-    left_out = len(outcomes) - len(chosen)
-    more = f"<p>and {left_out} more: to_frame() has all of them</p>" if left_out else ""
-    return f"<table><caption>{content(caption)}</caption>{head}{''.join(rows)}</table>{more}"
-
-
-def _chosen(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    if len(outcomes) <= _MOST_ROWS:
-        return list(outcomes)
-    places = [place for place, outcome in enumerate(outcomes) if outcome.has_failed][: _MOST_ROWS // 2]
-    others = (place for place, outcome in enumerate(outcomes) if not outcome.has_failed)
-    places += [place for place, _ in zip(others, range(_MOST_ROWS - len(places)), strict=False)]
-    return [outcomes[place] for place in sorted(places)]
-
-
-def _outcome_row(outcome: Outcome, pictures: list[str], sinks: Sequence[str]) -> str:
-    name = content(outcome.name)
-    if outcome.error_info is None:
-        values = [content(value_text(outcome.values[token])) if token in outcome.values else "" for token in sinks]
-        return html_row("td", [name, *pictures, *values, duration_text(outcome.total_ns)])
-    message = " ".join(str(outcome.error_info).split())
-    cut = message if len(message) <= _MESSAGE_CHARACTERS else f"{message[:_MESSAGE_CHARACTERS]}..."
-    style = f'style="text-align:left;color:{_ERROR}" title="{escape(message)}"'
-    failure = f'<td colspan="{len(sinks) + 1}" {style}>\u2717 {content(cut)}</td>'
-    cells = "".join(f"<td{LEFT}>{cell}</td>" for cell in (name, *pictures))
-    return f"<tr>{cells}{failure}</tr>"
-
-
-def html_row(tag: str, cells: Iterable[str]) -> str:
-    """Return a row of an HTML table; the cells are HTML."""
-    return f"<tr>{''.join(f'<{tag}{LEFT}>{cell}</{tag}>' for cell in cells)}</tr>"
-
-
-class Pictures:
-    """The pictures of one page, as far as there is room for them."""
-
-    def __init__(self) -> None:
-        self._room = _THUMBNAIL_CHARACTERS
-
-    def image(self, shown: Thumbnail | None, alt: str = "") -> str:
-        """Return a picture as HTML, with a text instead of its caption if one is given; "" without room for it."""
-        if shown is None:
-            return ""
-        text = escape(alt or shown.caption)
-        element = f'<img src="{data_uri(shown)}" alt="{text}" title="{text}">'
-        if len(element) > self._room:
-            return ""
-        self._room -= len(element)
-        return element
-
-
-def data_uri(shown: Thumbnail) -> str:
-    """Return a thumbnail as the address that an image element of a page has."""
-    return f"data:{shown.media_type};base64,{base64.b64encode(shown.data).decode()}"
+    failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
+    return html_table(caption, ["name", *shown, *sinks, "time"], rows, failures)
 
 
 def value_text(value: Any) -> str:
-    """Return a value of an outcome as a table shows it: a float to six digits."""
-    text = float_text(value) if isinstance(value, float) else str(value)
-    return text if len(text) <= _MESSAGE_CHARACTERS else f"{text[:_MESSAGE_CHARACTERS]}..."
+    """Return a value of an outcome or a setting as a table shows it: a float to six digits, a member by its name."""
+    return float_text(value) if isinstance(value, float) else str(getattr(value, "name", value))

@@ -1,19 +1,18 @@
-"""The result of a search: its trials, the best of them, its table, page and figures."""
+"""The trials of a search, and its result: the best of them, its table, page and figures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.batch.ranges import Axis
-from epypes.batch.results import frame_of, object_column
-from epypes.batch.study import Direction, Trial, importances, quiet_optuna
+from epypes.batch.grid import Axis
+from epypes.batch.results import frame_of, html_table, object_column, value_text
+from epypes.batch.thumbnails import data_uri, thumbnail_of_value
 from epypes.display.durations import duration_text
 from epypes.display.markup import content, cut, cut_name, escape
-from epypes.display.paint.rows import Table
-from epypes.display.paint.style import STYLE, page_style, paper_style
-from epypes.display.paint.tables import paint_table
 from epypes.errors import ScaleError
 from epypes.wording import counted
 
@@ -25,25 +24,32 @@ if TYPE_CHECKING:
 
     from epypes.run import CompGraphRunner
 
-_WIDTH: Final = 560
-_HEIGHT: Final = 200
-_LEFT, _RIGHT, _TOP, _BOTTOM = 76, 14, 14, 34
-# More dots than this can't be told apart; the line of the best has all trials.
-_MOST_DOTS: Final = 1_000
-_MOST_ROWS: Final = 30
-_MOST_REASONS: Final = 3
+Direction = Literal["maximize", "minimize"]
 
-_SCOPE: Final = ".epypes-graph.epypes-search"
-_RULES: Final = {
-    " text": "text-anchor:start;font-size:11px;fill:@quiet",
-    " .end": "text-anchor:end",
-    " .axis": "stroke:@line;stroke-width:1;fill:none",
-    " .trials": "stroke:@accent;stroke-opacity:.55;stroke-width:6;stroke-linecap:round;fill:none",
-    " .best": "stroke:@warn;stroke-width:2;fill:none",
-    " .top": "fill:@warn;stroke:@ground;stroke-width:1.5",
-    " .failed": "stroke:@error;stroke-width:1.4;fill:none",
-}
-_STYLE: Final = STYLE + paper_style(_SCOPE, _RULES) + page_style(_SCOPE, _RULES)
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One setting that was tried.
+
+    Attributes
+    ----------
+    number
+        Of the trial in its study, from 0.
+    setting
+        The hyperparameters that vary, by token.
+    value
+        The metric, averaged over the cases; None if the trial failed.
+    failure
+        Why it failed; empty if it did not.
+    total_ns
+        Nanoseconds of the functions that ran, over all cases.
+    """
+
+    number: int
+    setting: Mapping[str, Any]
+    value: float | None
+    failure: str = ""
+    total_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,9 +121,17 @@ class OptimizeResult:
     def importances(self) -> dict[str, float]:
         """How much each hyperparameter matters for good values, as parts of 1, the most important first.
 
-        By PED-ANOVA, as Optuna has it; empty if fewer than two different values were found.
+        By PED-ANOVA (Watanabe, Bansal and Hutter 2023, IJCAI), as Optuna has it; empty if fewer than two different
+        values were found.
         """
-        return importances(self.study)
+        import optuna
+
+        completed = self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+        if len({trial.value for trial in completed}) < 2:
+            return {}
+        with quiet_optuna():
+            evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+            return dict(optuna.importance.get_param_importances(self.study, evaluator=evaluator))
 
     def apply(self, runner: CompGraphRunner) -> None:
         """Set the best values on a runner."""
@@ -197,81 +211,49 @@ def _figure(draw: Callable[[], Axes]) -> Figure:
     return figure
 
 
+_MOST_REASONS: Final = 3
+
+
 def _page(result: OptimizeResult) -> str:
-    """Return a search as HTML: a sentence, its trials as a picture, the values found as a table, and its failures."""
-    parts = [f"<p>{content(_sentence(result))}</p>"]
     best = best_of(result.trials, result.direction)
+    parts = [f"<p>{content(_sentence(result))}</p>"]
     if best is not None:
-        parts += [_history(result, best), paint_table(_table(result, best))]
+        parts += [_curve(result), _table(result, best)]
     reasons = list(dict.fromkeys(trial.failure for trial in result.failures))
     if reasons:
         items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
         more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
         parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
-    return f'<div class="epypes-sheet">{"".join(parts)}</div>'
+    return f"<div>{''.join(parts)}</div>"
 
 
-def _history(result: OptimizeResult, best: Trial) -> str:
-    """Paint the value of each trial as a dot, the best so far as a line, failed trials as crosses at the foot."""
-    trials = result.trials
-    values = [trial.value for trial in trials if trial.value is not None]
-    low, high, last = min(values), max(values), max(trials[-1].number, 1)
-    foot, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
+def _curve(result: OptimizeResult) -> str:
+    """Return a picture of the best value so far, by trial that completed."""
+    import numpy as np
 
-    def x(number: int) -> str:
-        return f"{_LEFT + 8 + (right - _LEFT - 16) * number / last:.1f}"
-
-    def y(value: float) -> str:
-        share = (value - low) / (high - low) if high > low else 0.5
-        return f"{foot - 10 - (foot - _TOP - 20) * share:.1f}"
-
-    line, so_far = "", None
-    for trial in trials:
-        so_far = best_of([one for one in (so_far, trial) if one is not None], result.direction)
-        if so_far is trial:
-            at = x(trial.number), y(_value(trial))
-            line += "H{}V{}".format(*at) if line else "M{},{}".format(*at)
-    some = trials[:: -(-len(trials) // _MOST_DOTS)]
-    dots = "".join(f"M{x(trial.number)} {y(trial.value)}h0" for trial in some if trial.value is not None)
-    crosses = "".join(
-        f"M{float(x(trial.number)) - 3:.1f},{foot - 9}l6,6m0,-6l-6,6" for trial in some if trial.value is None
-    )
-    ends = "".join(
-        f'<text class="end" x="{_LEFT - 6}" y="{float(y(value)) + 4:.1f}">{value:.4g}</text>'
-        for value in dict.fromkeys((low, high))
-    )
-    caption = f"{cut_name(result.metric, 30)} by trial; the line is the best so far"
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph epypes-search" role="figure" '
-        f'aria-label="{escape(f"{_sentence(result)} The line is the best so far.")}" '
-        f'width="{_WIDTH}" height="{_HEIGHT}" viewBox="0 0 {_WIDTH} {_HEIGHT}">\n<style>{_STYLE}</style>\n'
-        f'<rect class="shape" x=".5" y=".5" width="{_WIDTH - 1}" height="{_HEIGHT - 1}" rx="8"/>'
-        f'<path class="axis" d="M{_LEFT},{_TOP}V{foot}H{right}"/>{ends}'
-        f'<text x="{x(0)}" y="{foot + 14}">0</text><text class="end" x="{x(last)}" y="{foot + 14}">{last}</text>'
-        f'<text x="{_LEFT}" y="{_HEIGHT - 7}">{content(caption)}</text>\n'
-        f'<path class="trials" d="{dots}"/><path class="failed" d="{crosses}"/>'
-        f'<path class="best" d="{line}H{x(last)}"/>'
-        f'<circle class="top" cx="{x(best.number)}" cy="{y(_value(best))}" r="5"/>\n</svg>'
-    )
+    values = [trial.value for trial in result.trials if trial.value is not None]
+    so_far = np.maximum.accumulate(values) if result.direction == "maximize" else np.minimum.accumulate(values)
+    picture = thumbnail_of_value(so_far)
+    if picture is None:
+        return ""
+    alt = escape(f"The best {cut_name(result.metric, 30)} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}.")
+    return f'<img src="{data_uri(picture)}" width="256" alt="{alt}" title="{alt}">'
 
 
-def _table(result: OptimizeResult, best: Trial) -> Table:
+def _table(result: OptimizeResult, best: Trial) -> str:
     first, parts = result.trials[0], result.importances
     rows = [
         (
             axis.token,
-            _text(best.setting[axis.token]),
-            _text(first.setting[axis.token]),
+            value_text(best.setting[axis.token]),
+            value_text(first.setting[axis.token]),
             f"{parts[axis.token]:.0%}" if axis.token in parts else "",
         )
         for axis in sorted(result.axes, key=lambda axis: -parts.get(axis.token, 0.0))
-    ][:_MOST_ROWS]
+    ]
     values = (result.metric, f"{best.value:.6g}", "failed" if first.value is None else f"{first.value:.6g}", "")
-    return Table("", ("hyperparameter", f"best (trial {best.number})", "first trial", "importance"), [*rows, values])
-
-
-def _text(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else cut(str(getattr(value, "name", value)), 40)
+    head = ("hyperparameter", f"best (trial {best.number})", "first trial", "importance")
+    return html_table("", head, [values, *rows])
 
 
 def _sentence(result: OptimizeResult) -> str:
@@ -284,3 +266,18 @@ def _sentence(result: OptimizeResult) -> str:
         return f"{trials} None has completed."
     what = f"To {result.direction} {cut_name(result.metric, 40)}"
     return f"{trials} {what}: {best.value:.6g} is the best, of trial {best.number}."
+
+
+@contextmanager
+def quiet_optuna() -> Iterator[None]:
+    """Keep Optuna from printing, and from warning that a feature used here was once experimental."""
+    import optuna
+
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            yield
+    finally:
+        optuna.logging.set_verbosity(before)

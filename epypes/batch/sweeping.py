@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
-from functools import partial
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cache import outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of
-from epypes.batch.executors import run_jobs, runs_here, worker_count
-from epypes.batch.grid import Grid, Setting, functions_after, grid_of, running_order, steps
-from epypes.batch.items import Item, count_of, detached_runner, items_of
-from epypes.batch.job import Job, SharedStart
-from epypes.batch.mapping import OutcomeCollector
-from epypes.batch.progress import progress_bar
-from epypes.batch.results import FIXED_COLUMNS, Outcome, outcomes_frame
+from epypes.batch.grid import Grid, functions_after, grid_of
+from epypes.batch.items import Item, count_of
+from epypes.batch.mapping import run_items, tokens_of
+from epypes.batch.results import FIXED_COLUMNS, Outcome, OutcomeSequence, outcomes_frame
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.run import CompGraphRunner
 from epypes.store import Store
@@ -29,13 +23,10 @@ if TYPE_CHECKING:
 
 # Each of at most 5 KB, and some belong to several outcomes.
 _MOST_PICTURES: Final = 200_000
-# Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
-_PARTS: Final = 16
-_MOST_SETTINGS: Final = 256
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SweepResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SweepResult(OutcomeSequence):
     """The results of a sweep; shows itself as a contact sheet.
 
     Attributes
@@ -50,21 +41,7 @@ class SweepResult:
 
     outcomes: tuple[Outcome, ...]
     names: tuple[str, ...]
-    runner: CompGraphRunner = field(repr=False)
-
-    def __len__(self) -> int:
-        return len(self.outcomes)
-
-    def __getitem__(self, place: int) -> Outcome:
-        return self.outcomes[place]
-
-    def __iter__(self) -> Iterator[Outcome]:
-        return iter(self.outcomes)
-
-    @property
-    def failures(self) -> tuple[Outcome, ...]:
-        """The outcomes in which something failed."""
-        return tuple(outcome for outcome in self.outcomes if outcome.error_info is not None)
+    runner: CompGraphRunner
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table with a row per outcome.
@@ -180,60 +157,23 @@ def sweep(
     >>> [outcome.values["total"] for outcome in result]
     [11, 21, 12, 22]
     """
-    given, runner = runner, detached_runner(runner)
-    kept, shown = _tokens(runner, keep), None if show is None else _tokens(runner, show)
+    if images is None:
+        images = [Item(0, "last payload", _last_payload(runner))]
     plan = grid_of(runner, grid, how=how, n=n, seed=seed)
-    count = 1 if images is None else count_of(images)
-    _require_room(runner, plan, shown, count or 1)
-    settings = plan.settings()
-    # By object: a setting comes back as the very mapping that was sent.
-    places = {id(setting): place for place, setting in enumerate(settings)}
-    in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
-    with (
-        progress_bar(progress, count and count * plan.size, "sweep", unit="setting") as advance,
-        outcome_cache(store, "sweep", runner, name, keep=kept, show=shown, varied=plan.names) as cache,
-    ):
-        collector = OutcomeCollector(cache, advance)
-        is_copied = executor is not None or cache is not None or bool(kept)
-        items = _items(given, images, plan, is_copied=is_copied)
-        make = partial(Job, keep=kept, show=shown)
-        for outcomes in run_jobs(runner, _jobs(runner, make, in_order, items, collector, executor, count), executor):
-            collector.add(outcomes)
-    found = sorted(collector.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
-    return SweepResult(tuple(found), plan.names, given)
+    _require_room(runner, plan, show, count_of(images) or 1)
+    outcomes = run_items(
+        runner, images, plan.settings(), executor,
+        kind="sweep", keep=keep, show=show, store=store, name=name, progress=progress,
+    )  # fmt: skip
+    return SweepResult(outcomes, plan.names, runner)
 
 
-def _jobs(
-    runner: CompGraphRunner,
-    make: Callable[..., Job],
-    in_order: tuple[Setting, ...],
-    items: Iterator[Item],
-    collector: OutcomeCollector,
-    executor: Executor | None,
-    images: int | None,
-) -> Iterator[Job]:
-    """Yield the jobs of each item: its settings in parts, which in this process share the item's first run."""
-    for item in items:
-        settings = collector.missing_settings(item, in_order)
-        cuts = _cuts(runner, settings, executor, images) if settings else []
-        start = SharedStart() if len(cuts) > 2 and runs_here(executor) else None
-        for first, end in pairwise(cuts):
-            yield make(item, settings[first:end], start=start)
-        # This generator waits for its caller, and must not keep the item alive meanwhile.
-        del item, start
-
-
-def _tokens(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:
-    tokens = (given,) if isinstance(given, str) else tuple(given)
-    for token in tokens:
-        runner.cg.require_token(token)
-    return tokens
-
-
-def _require_room(runner: CompGraphRunner, plan: Grid, shown: Sequence[str] | None, images: int) -> None:
+def _require_room(runner: CompGraphRunner, plan: Grid, show: Sequence[str] | None, images: int) -> None:
+    """Raise ScaleError if the outcomes, or their thumbnails, are too many to hold."""
     plan.require_room(images)
-    varying = {name for varied in plan.names for name in _made_after(runner, varied)}
-    tokens = varying if shown is None else varying.intersection(shown)
+    after = {function for name in plan.names for function in functions_after(runner.cg, name)}
+    varying = {token for function in after for token in runner.cg.func_outputs(function)}
+    tokens = varying if show is None else varying.intersection(tokens_of(runner, show))
     pictures = plan.size * images * len(tokens)
     if pictures > _MOST_PICTURES:
         raise ScaleError(
@@ -243,49 +183,9 @@ def _require_room(runner: CompGraphRunner, plan: Grid, shown: Sequence[str] | No
         )
 
 
-def _made_after(runner: CompGraphRunner, name: str) -> Iterator[str]:
-    """Yield the tokens that depend on a hyperparameter."""
-    for function in functions_after(runner.cg, name):
-        yield from runner.cg.func_outputs(function)
-
-
-def _items(runner: CompGraphRunner, images: Any, plan: Grid, *, is_copied: bool) -> Iterator[Item]:
-    if images is None:
-        yield Item(0, "last payload", _last_payload(runner))
-        return
-    for item in items_of(images, runner, is_copied=is_copied):
-        # How many a generator gives is known when it gives them.
-        plan.require_room(item.number + 1)
-        yield item
-        del item
-
-
 def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
     free, last = runner.free_source_tokens, runner.last
     missing = free if last is None else tuple(token for token in free if not last.tokens.is_computed(token))
     if missing:
         raise PayloadError(missing, f"Nothing has been run yet. Give images=..., or call {run_call(free)} first.")
     return {} if last is None else {token: last[token] for token in free}
-
-
-# -- parts of a grid ------------------------------------------------------------------------------------------------
-
-
-def _cuts(
-    runner: CompGraphRunner, settings: Sequence[Setting], executor: Executor | None, images: int | None
-) -> list[int]:
-    """Return where the settings of an item are cut into parts: from 0 to their number."""
-    if executor is None:
-        # Each begins where the one before has ended, so they are for progress only.
-        parts, places = _PARTS, list(range(len(settings)))
-    else:
-        workers = worker_count(executor)
-        # Outside of this process each part computes what all have in common: there are only as many as keep all
-        # workers at work.
-        parts = -(-workers // max(images or workers, 1))
-        parts *= _PARTS if parts > 1 and runs_here(executor) else 1
-        # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
-        places = steps(runner.cg, settings)
-        places = places if len(places) >= workers else list(range(len(settings)))
-    parts = min(max(parts, -(-len(settings) // _MOST_SETTINGS)), len(places))
-    return [*(places[len(places) * part // parts] for part in range(parts)), len(settings)]

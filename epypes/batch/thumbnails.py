@@ -6,17 +6,18 @@ white has a display range of its own, which its caption states.
 
 from __future__ import annotations
 
+import base64
 import io
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from epypes.batch.results import Thumbnail
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.imagekinds import image_kind, is_image, sampled
 from epypes.display.previews.preview import finished, looked_closer, sketch
 from epypes.display.previews.ranges import display_range, sole_value
-from epypes.display.previews.raster import THUMBNAIL_PX
+from epypes.display.previews.raster import THUMBNAIL_PX, encode_small
 from epypes.display.previews.short import float_text
 from epypes.display.previews.shown import Look, Sketch
 from epypes.display.views.backdrops import RunSurroundings
@@ -30,6 +31,25 @@ _CHART_STYLE: Final = (
     "<style>.paper{fill:none}.chart polyline,.bars,.dots{fill:none;stroke:#7a8490;stroke-width:2}"
     ".dots{stroke-width:4;stroke-linecap:round}</style>"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Thumbnail:
+    """A small picture of a token's value.
+
+    Attributes
+    ----------
+    media_type
+        ``"image/jpeg"``, ``"image/png"`` or ``"image/svg+xml"``.
+    data
+        The bytes of such a file.
+    caption
+        What it is of, as ``"uint8 400 x 600"``.
+    """
+
+    media_type: str
+    data: bytes
+    caption: str
 
 
 def thumbnail_of(run: Run, token: str) -> Thumbnail | str:
@@ -68,7 +88,8 @@ def _as_file(sketched: Sketch) -> Thumbnail | str:
         return Thumbnail(shown.picture.media_type, shown.picture.data, caption)
     if shown.chart is None:
         return shown.text
-    size, painted = f'width="{THUMB_WIDTH}" height="{THUMB_HEIGHT}"', paint_thumbnail(shown, (THUMB_WIDTH / 2, 0))
+    size = f'width="{THUMB_WIDTH}" height="{THUMB_HEIGHT}" viewBox="0 0 {THUMB_WIDTH} {THUMB_HEIGHT}"'
+    painted = paint_thumbnail(shown, (THUMB_WIDTH / 2, 0))
     chart = f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{_CHART_STYLE}{painted}</svg>'
     return Thumbnail("image/svg+xml", chart.encode(), caption)
 
@@ -155,3 +176,29 @@ def _mask_difference(got: Any, wanted: Any) -> Thumbnail:
     picture.save(data, "PNG", bits=2)
     pixels = np.count_nonzero(got != wanted)
     return Thumbnail("image/png", data.getvalue(), f"{pixels} of {got.size} pixels differ")
+
+
+# -- on a page --------------------------------------------------------------------------------------------------
+
+# What a smaller picture shows is hardly seen.
+_LEAST_BYTES: Final = 400
+
+
+def data_uri(shown: Thumbnail) -> str:
+    """Return a thumbnail as the address that an image element of a page has."""
+    return f"data:{shown.media_type};base64,{base64.b64encode(shown.data).decode()}"
+
+
+def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:
+    """Return a picture within so many bytes; None if nothing would be seen on it."""
+    if len(thumbnail.data) <= most_bytes:
+        return thumbnail
+    if most_bytes < _LEAST_BYTES or thumbnail.media_type == "image/svg+xml":
+        return None
+    with optional_import("scale"):
+        from PIL import Image
+
+    with Image.open(io.BytesIO(thumbnail.data)) as opened:
+        opened.load()
+        encoded = encode_small(opened, most_bytes)
+    return replace(thumbnail, media_type=encoded.media_type, data=encoded.data)

@@ -258,7 +258,7 @@ hyperparameters = {k = {value = 3, kind = "tupel"}}
     assert "cases.toml, line 9: No key 'input' in case 'right'. Did you mean 'inputs'?" in told
     assert "cases.toml, line 12: The checks in this case are tables: [[case.check]]." in told
     assert "cases.toml, line 15: There are no inputs in this case." in told
-    assert "cases.toml, line 16: hyperparameters in this case is a table, not 3." in told
+    assert "cases.toml, line 16: hyperparameters of a case must be a dict, not 'int'." in told
     assert "cases.toml, line 22: Hyperparameter 'k' can't be read: no value has the kind 'tupel'. Write it as" in told
     assert "cases.toml, line 19: The name of a case is a text, not 3." in told
 

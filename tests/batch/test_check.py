@@ -311,7 +311,7 @@ def test_many_failures_stay_a_small_page(runner, coins):
     result = ep.check(runner, [ep.Case(coins, {"mask": label}, name=f"case {number}") for number in range(120)])
     page = result._repr_html_()
     assert len(page) < 150_000
-    assert "and 20 checks more" in page
+    assert "and 20 more: to_frame() has all of them" in page
 
 
 def test_junit_says_what_failed_what_could_not_be_measured_and_how_long_it_took(result, tmp_path):

@@ -14,7 +14,8 @@ import epypes as ep
 from epypes.batch.items import Item, items_of
 from epypes.batch.job import Job, run_job
 from epypes.batch.packaged_graph import packed_job, unpacked_job
-from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, outcomes_frame
+from epypes.batch.results import ErrorInfo, Outcome, outcomes_frame
+from epypes.batch.thumbnails import Thumbnail
 
 
 def ran(runner, *jobs):

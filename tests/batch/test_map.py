@@ -136,7 +136,7 @@ def test_many_rows_with_thumbnails_stay_small(runner, crops):
     result = ep.map(runner, crops * 10, show=None)
     html = result._repr_mimebundle_()["text/html"]
     assert len(html) < 120_000
-    assert "and 90 more: to_frame() has all of them" in html
+    assert "and 20 more: to_frame() has all of them" in html
 
 
 # -- going on ---------------------------------------------------------------------------------------------------

@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 
 import epypes as ep
-from epypes.batch.contact_sheet import Tile, short_text
-from epypes.batch.results import Thumbnail
+from epypes.batch.contact_sheet import Tile
+from epypes.batch.results import short_text
+from epypes.batch.thumbnails import Thumbnail
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName
 

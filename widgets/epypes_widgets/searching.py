@@ -17,8 +17,7 @@ from epypes_widgets.places import Tunable
 from epypes_widgets.values import said
 
 if TYPE_CHECKING:
-    from epypes.batch.search_result import OptimizeResult
-    from epypes.batch.study import Direction, Trial
+    from epypes.batch.search_result import Direction, OptimizeResult, Trial
 
 _LOG: Final = logging.getLogger(__name__)
 # The eye follows no more, and each time the whole curve goes to the page.
