@@ -21,16 +21,11 @@ from epypes.run.guard import as_written
 
 # -- clones ------------------------------------------------------------------------------------------------------------
 
-# A node may be made to wrap itself; no graph needs to wrap this deep.
-_DEEPEST: Final = 100
-
 
 def called_by(function: Any) -> Any:
     """Return the function of a node that does nothing else than call it; anything else as it is."""
-    for _ in range(_DEEPEST):
+    while isinstance(function, Node) and not isinstance(function, Pipeline):
         kind = type(function)
-        if not isinstance(function, Node) or isinstance(function, Pipeline):
-            break
         if kind.compute is not Node.compute or kind.__call__ is not Node.__call__:
             break
         function = as_written(function.func)

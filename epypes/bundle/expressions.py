@@ -144,7 +144,9 @@ def literal_value(expression: ast.expr) -> Any:
 # -- expressions -------------------------------------------------------------------------------------------------------
 
 # Their objects know the call that makes them.
-_KNOW_THEIR_CALL: Final = (itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal, logging.Logger)
+_KNOW_THEIR_CALL: Final = (
+    range, slice, itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal, logging.Logger,
+)  # fmt: skip
 # More numbers are too many to read.
 _MOST_NUMBERS: Final = 200
 _MOST_CHARACTERS: Final = 400
@@ -290,13 +292,6 @@ class _Writer:
         gathered, arrays = self.gathered, self.gathered.arrays
         name = next((name for name, other in arrays.items() if other is array), "")
         if not name:
-            size = sum(other.nbytes for other in arrays.values()) + array.nbytes
-            if size > MOST_BYTES:
-                raise Refused(
-                    f"{self.what} uses an array, with which the bundle's arrays have {size / 1e6:.1f} MB; "
-                    f"{MOST_BYTES / 1e6:g} MB are the most. Pass it in as a token, or put it into the data of a "
-                    "package that is installed and read it with importlib.resources."
-                )
             if READER not in gathered.definitions:
                 gathered.reserve(READER)
                 modules = {name: gathered.module_name(name, self.what) for name in ("numpy", "pathlib")}
@@ -314,9 +309,6 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         return float, (repr(value),)
     if kind is frozenset:
         return frozenset, (set(value),) if value else ()
-    if kind in (range, slice):
-        is_usual = value.step == (1 if kind is range else None)
-        return kind, (value.start, value.stop) if is_usual else (value.start, value.stop, value.step)
     if kind is re.Pattern:  # the flag for text is what re.compile adds by itself
         flags = re.RegexFlag(value.flags & ~re.UNICODE)
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)
@@ -339,7 +331,6 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
 
 ARRAYS: Final = "arrays"
 READER: Final = "stored_array"
-MOST_BYTES: Final = 16_000_000
 _TEXT: Final = '''def {reader}(name):
     """Return an array that this bundle keeps as a file; it can't be written to."""
     array = {numpy}.load({pathlib}.Path(__file__).with_name("{folder}") / f"{{name}}.npy", allow_pickle=False)

@@ -7,24 +7,15 @@ from __future__ import annotations
 
 import ast
 import enum
+import functools
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 from epypes.bundle.clone import arguments_of, parameters_of
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import (
-    ARRAYS,
-    LINE,
-    bracketed,
-    escaped,
-    expression_or_none,
-    laid_out,
-    names_in,
-    quoted,
-)
+from epypes.bundle.expressions import ARRAYS, LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.notebook_source import Position, parsed
 from epypes.bundle.resolve import Refused
@@ -61,15 +52,15 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 
 def write_module(
     cg: CompGraph, settings: Settings, ports: Mapping[str, Callable[..., Any]], pipeline: Pipeline | None
-) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays by file, the refusals.
+) -> tuple[str, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the arrays that it reads by file, and the reasons against it.
 
     Parameters
     ----------
     cg
         The graph with the user's own functions.
     settings
-        The bundle's settings, but for ``own``.
+        The bundle's settings.
     ports
         f_in and f_out, as far as they are not the usual ones of a bundle.
     pipeline
@@ -79,7 +70,6 @@ def write_module(
     members = [member for value in values for member in members_in(value)]
     enums = {type(member).__qualname__: type(member) for member in members if isinstance(member, enum.Enum)}
     own = {MAKER: pipeline is not None, "enums": bool(enums), "func_groups": settings.has_groups}
-    reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
 
     def write(gathered: Slice) -> tuple[dict[str, str], list[str], list[str]]:
         graphs, behind = Graphs(gathered), list[str]()
@@ -93,37 +83,42 @@ def write_module(
         if pipeline is not None:
             with gathered.noted_refusals():
                 graphs.write_maker(pipeline)
-        if enums:
-            kinds = [
-                (name, graphs.value(kind, f"Class {name!r} of a hyperparameter", name)) for name, kind in enums.items()
-            ]
-            items = ", ".join(f"{quoted(name)}: {reference}" for name, reference in kinds)
-            behind.append(f"# Whose members stand in pipeline.toml.\n{_assigned('enums', items)}")
+        kinds = {name: graphs.value(kind, f"Class {name!r} of a hyperparameter", name) for name, kind in enums.items()}
+        if kinds:
+            behind.append(f"# Whose members stand in pipeline.toml.\n{_assigned('enums', kinds)}")
         return references, graphs.blocks, behind
 
-    def pairs(module: Any) -> Iterator[Pair]:
-        for name, function in cg.functions.items():
-            yield f"Function {name!r}", function, module.func_dict[name]
-        for name, port in ports.items():
-            yield f"Function {name!r}", port, getattr(module, name)
-        for name, kind in enums.items():
-            yield f"Class {name!r}", kind, module.enums[name]
-        if pipeline is not None:
-            given = [getattr(pipeline, name, None) for name in _GIVEN[1:5]]
-            made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
-            if isinstance(pipeline, FullPipeline):
-                yield f"Pipeline {pipeline.name!r}", pipeline, made
-            else:
-                yield f"Class of pipeline {pipeline.name!r}", type(pipeline), type(made).__bases__[1]
-
-    gathered, (references, blocks, behind) = gather(write, reserved, stores_arrays=True)
-    settings = replace(settings, own=(*ports, *([MAKER] if pipeline is not None else ())))
+    reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
+    gathered, (references, before, behind) = gather(write, reserved, stores_arrays=True)
     if gathered.refusals:
-        return "", settings, {}, list(dict.fromkeys(gathered.refusals))
+        return "", {}, list(dict.fromkeys(gathered.refusals))
     arrays = {f"{ARRAYS}/{name}.npy": array for name, array in gathered.arrays.items()}
-    module = emit_module(settings, cg, gathered, references, blocks, behind)
-    why = refusal(module, arrays, pairs)
-    return module, settings, arrays, [why] if why else []
+    module = emit_module(settings, cg, gathered, references, before, behind)
+    why = refusal(module, arrays, functools.partial(_pairs, cg, ports, pipeline, enums))
+    return module, arrays, [why] if why else []
+
+
+def _pairs(
+    cg: CompGraph,
+    ports: Mapping[str, Any],
+    pipeline: Pipeline | None,
+    enums: Mapping[str, type],
+    module: Any,
+) -> Iterator[Pair]:
+    """Give what of the notebook is compared with the module, by how a reason calls it."""
+    for name, function in cg.functions.items():
+        yield f"Function {name!r}", function, module.func_dict[name]
+    for name, port in ports.items():
+        yield f"Function {name!r}", port, getattr(module, name)
+    for name, kind in enums.items():
+        yield f"Class {name!r}", kind, module.enums[name]
+    if pipeline is not None:
+        given = [getattr(pipeline, name, None) for name in _GIVEN[1:5]]
+        made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
+        if isinstance(pipeline, FullPipeline):
+            yield f"Pipeline {pipeline.name!r}", pipeline, made
+        else:
+            yield f"Class of pipeline {pipeline.name!r}", type(pipeline), type(made).__bases__[1]
 
 
 def emit_module(
@@ -152,38 +147,33 @@ def emit_module(
         What stands behind it: what the bundle has of its own.
     """
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
-    titles = [escaped(f"The computational graph {settings.name}{more}.") for more in (f": {ends}", "")]
+    title = escaped(f"The computational graph {settings.name}: {ends}.", LINE - len('"""'))
     run = f"    runner.{run_call(settings.inputs)}"
     if not all(token.isidentifier() for token in settings.inputs) or len(run) > LINE:
         run = "    runner.run(**payload)"
-    head = _TEXT.format(title=next((title for title in titles if len(title) <= LINE - 3), titles[-1]), run=run)
-    functions, io = _dicts(cg, references)
-    blocks = [*before, _assigned("func_dict", functions), _assigned("func_io", io)]
+    head = _TEXT.format(title=title, run=run)
+    blocks = [*before, _assigned("func_dict", references), _io("func_io", cg)]
     if cg.groups:
-        items = ", ".join(f"{quoted(name)}: {bracketed([*part], quoted)}" for name, part in cg.groups.items())
-        blocks.append(f"# Drawn as one box each.\n{_assigned('func_groups', items)}")
+        groups = {name: bracketed([*part], quoted) for name, part in cg.groups.items()}
+        blocks.append(f"# Drawn as one box each.\n{_assigned('func_groups', groups)}")
     return module_text(needed, "\n\n".join([*blocks, *behind]), head)
 
 
-def _assigned(variable: str, items: str) -> str:
+def _assigned(variable: str, items: Mapping[str, str]) -> str:
     """Return the lines of a dict that has a variable."""
-    return "\n".join(laid_out(f"{{{items}}}", before=f"{variable} = ", is_broken=True))
+    inner = ", ".join(f"{quoted(name)}: {source}" for name, source in items.items())
+    return "\n".join(laid_out(f"{{{inner}}}", before=f"{variable} = ", is_broken=True))
 
 
-def _dicts(cg: CompGraph, references: Mapping[str, str]) -> tuple[str, str]:
-    """Return the items of the dicts that a graph is made of: its functions, and what each takes and makes."""
-    functions, io = list[str](), list[str]()
-    for name, reference in references.items():
-        is_switch = as_switch(cg.functions[name]) is not None
-        functions.append(f"**{reference}.functions" if is_switch else f"{quoted(name)}: {reference}")
-        io.append(f"{quoted(name)}: {bracketed(tuple(cg.func_io[name]), _side)}")
-    return ", ".join(functions), ", ".join(io)
+def _io(variable: str, cg: CompGraph) -> str:
+    """Return the lines of what each function of a graph takes and makes."""
 
+    def side(tokens: str | Iterable[str] | None) -> str:
+        if tokens is None or isinstance(tokens, str):
+            return "None" if tokens is None else quoted(tokens)
+        return bracketed(tuple(tokens), quoted)
 
-def _side(tokens: str | Iterable[str] | None) -> str:
-    if tokens is None or isinstance(tokens, str):
-        return "None" if tokens is None else quoted(tokens)
-    return bracketed(tuple(tokens), quoted)
+    return _assigned(variable, {name: bracketed(tuple(sides), side) for name, sides in cg.func_io.items()})
 
 
 class Graphs:
@@ -249,7 +239,8 @@ class Graphs:
         output = quoted(cg.func_outputs(name)[0])
         epypes = self.gathered.module_name("epypes", what)
         made = f"{epypes}.switch({quoted(name)}, {{{branches}}}, by={quoted(by)}, output={output})"
-        return self._variable(name, made, f"# Only the branch that {escaped(by, 80)} chooses is computed.")
+        variable = self._variable(name, made, f"# Only the branch that {escaped(by, 80)} chooses is computed.")
+        return f"{variable}.functions[{quoted(name)}]"
 
     def _arguments(self, made: Node, what: str, name: str, besides: Sequence[str] = ()) -> list[str]:
         """Return the arguments that make a node or pipeline again, but for some."""
@@ -263,11 +254,11 @@ class Graphs:
 
     def _inner_graph(self, cg: CompGraph, what: str, name: str) -> str:
         """Write the graph of a pipeline; return its expression."""
-        functions, io = _dicts(cg, self.write(cg, f" of {what[0].lower()}{what[1:]}"))
+        references = self.write(cg, f" of {what[0].lower()}{what[1:]}")
         variables = self.gathered.free_name(f"{name}_functions"), self.gathered.free_name(f"{name}_io")
         ends = f"{', '.join(cg.source_tokens) or 'nothing'} -> {', '.join(cg.sink_tokens) or 'nothing'}"
         comment = f"# {escaped(f'A graph of its own: {ends}.', 80)}"
-        self.blocks.append("\n".join([comment, *map(_assigned, variables, (functions, io))]))
+        self.blocks.append("\n".join([comment, _assigned(variables[0], references), _io(variables[1], cg)]))
         epypes = self.gathered.module_name("epypes", what)
         source = f"{epypes}.CompGraph({', '.join(variables)}{'' if cg.types else ', types=False'})"
         for group, members in cg.groups.items():
@@ -275,39 +266,32 @@ class Graphs:
         return source
 
     def write_maker(self, pipeline: Pipeline) -> None:
-        """Write the function that makes the pipeline of a user's class.
+        """Write the function that makes the pipeline of a user's class; of one that takes no events, one that does.
 
         Raises
         ------
         Refused
             A service can't make it, or can't give it events.
         """
-        kind, what, definitions = type(pipeline), f"Pipeline {pipeline.name!r}", self.gathered.definitions
+        kind, what = type(pipeline), f"Pipeline {pipeline.name!r}"
         known, taken = (
             self.gathered.add_class(kind, _class_of(pipeline, what)),
             [one.name for one in parameters_of(kind)],
         )
-        if not isinstance(pipeline, FullPipeline):
-            of_user = [vars(above) for above in kind.__mro__ if above not in FullPipeline.__mro__]
-            if isinstance(pipeline, SourcePipeline) or any("emit" in own or "__init__" in own for own in of_user):
-                text = f"{what} is of class {kind.__name__!r}, which takes no events, or has an __init__ or emit of its own"
-                raise Refused(f"{text}. Make it a subclass of ep.FullPipeline.")
-            full, answering = (
-                self.gathered.module_name("epypes", what),
-                self.gathered.free_name(f"Answering{kind.__name__}"),
-            )
-            definitions[answering] = (
-                f'class {answering}({full}.FullPipeline, {known}):\n    """{kind.__name__}, driven by events."""\n'
-            )
-            known, taken = answering, [*_GIVEN]
-        for name in ("cg", "q_in", "q_out", "hparams"):
-            if name not in taken:
-                text = f"{what} is of class {kind.__name__!r}, whose __init__ does not take {name!r}"
-                raise Refused(f"{text}. Take it, and hand it on: super().__init__(..., {name}={name}).")
+        of_user = {name for above in kind.__mro__ if above not in FullPipeline.__mro__ for name in vars(above)}
+        if not isinstance(pipeline, FullPipeline | SourcePipeline) and not of_user & {"__init__", "emit"}:
+            full = f"{self.gathered.module_name('epypes', what)}.FullPipeline"
+            known, taken = f'type("Answering{kind.__name__}", ({full}, {known}), {{}})', [*_GIVEN]
+        missing = [name for name in ("cg", "q_in", "q_out", "hparams") if name not in taken]
+        if missing:
+            text = f"{what} is of class {kind.__name__!r}, to which a service can't give {', '.join(missing)}"
+            way_out = "Make it a subclass of ep.FullPipeline, whose __init__ takes them, and hands them on"
+            raise Refused(f"{text}. {way_out}: super().__init__(..., {missing[0]}={missing[0]}).")
         arguments = self._arguments(pipeline, what, pipeline.name, _GIVEN)
         arguments += [f"{name}={name}" for name in _GIVEN if name in taken]
         head = [f"def {MAKER}({', '.join(_GIVEN)}):", '    """Return the pipeline that answers events."""']
-        definitions[MAKER] = "\n".join([*head, *laid_out(f"{known}({', '.join(arguments)})", 1, "return ")])
+        made = laid_out(f"{known}({', '.join(arguments)})", 1, "return ")
+        self.gathered.definitions[MAKER] = "\n".join([*head, *made])
 
 
 def _class_of(made: Node, what: str) -> str:

@@ -11,12 +11,12 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.clone import clone_runner, parameters_of
 from epypes.bundle.expressions import write_arrays
-from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
+from epypes.bundle.load import MAKER, MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.proof import draft_folder, prove, swap_folders
@@ -33,11 +33,6 @@ from epypes.graph import colour_order
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import as_written
-
-_NO_RUNNER: Final = (
-    "An object of class {} can't be promoted. Make a runner and run it: "
-    "runner = CompGraphRunner(cg, hparams); runner.run(...)."
-)
 
 
 def _ignore(text: str) -> None:
@@ -110,28 +105,23 @@ def _ports(given: object, f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]
         taken = {parameter.name for parameter in parameters_of(type(given))}
         ports |= {name: getattr(given, name, None) for name in ports if ports[name] is None and name in taken}
     elif not isinstance(given, CompGraphRunner):
-        raise Refused(_NO_RUNNER.format(type(given).__name__))
+        way_out = "Make a runner and run it: runner = CompGraphRunner(cg, hparams); runner.run(...)."
+        raise Refused(f"An object of class {type(given).__name__} can't be promoted. {way_out}")
     return {name: as_written(port) for name, port in ports.items() if port is not None and not is_usual(port)}
 
 
 def _check_place(target: Path) -> None:
-    """Refuse to write over what is not a bundle, or into one."""
-    why = _why_not_replaced(target)
-    if why:
-        raise Refused(why)
+    """Refuse to write over what is neither a bundle nor an empty folder, or into a bundle."""
     around = next((parent for parent in target.parents if (parent / MANIFEST).is_file()), None)
     if around is not None:
         raise Refused(f"{target} is inside the bundle {around}, whose files may not change. Name another folder.")
-
-
-def _why_not_replaced(target: Path) -> str:
-    """Return why what is at a place may not be replaced; "" if it is a bundle, an empty folder, or nothing."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return ""
+        return
     if not (target / MANIFEST).is_file():
-        return f"{target} exists and is not a bundle. Name another folder, or remove it."
+        raise Refused(f"{target} exists and is not a bundle. Name another folder, or remove it.")
     why = why_no_bundle(target)
-    return f"{why} Replacing it would delete what it holds: name another folder, or move that away." if why else ""
+    if why:
+        raise Refused(f"{why} Replacing it would delete what it holds: name another folder, or move that away.")
 
 
 def _write(
@@ -152,14 +142,14 @@ def _write(
         cg.require_token(token)
     hyperparameters, stored = store_arrays(runner.hyperparameters)
     free = runner.free_source_tokens
+    rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
+    pipeline = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None
     settings = Settings(
-        target.name, free, wanted, hyperparameters,
-        rgb=tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb"),
-        defaults=writable_defaults(cg, hyperparameters), types=cg.types, attributes=attributes, has_groups=bool(cg.groups),
+        target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
+        own=(*ports, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
     )  # fmt: skip
     reasons = [*_unready(runner, wanted), *unwritable(hyperparameters), *unwritable(attributes, "Attribute")]
-    own = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None
-    module, settings, arrays, refusals = write_module(cg, settings, ports, own)
+    module, arrays, refusals = write_module(cg, settings, ports, pipeline)
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
     runs = [*_runs(runner, samples)]
@@ -176,9 +166,7 @@ def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:
     if runner.last is not None:  # as _unready has made sure
         yield runner.last
     for number, sample in enumerate(samples, 1):
-        payload = sample
-        if not isinstance(sample, Mapping):
-            payload = dict(zip(runner.free_source_tokens[:1], [sample], strict=False))
+        payload = sample if isinstance(sample, Mapping) else dict.fromkeys(runner.free_source_tokens[:1], sample)
         try:
             run = clone_runner(runner).run_on(payload)
         except Exception as error:  # whatever a function raises on it
@@ -216,12 +204,7 @@ def _record(path: Path, run: Run, settings: Settings, f_out: Callable[..., Any] 
 def _replace(draft: Path, target: Path) -> None:
     """Put the new bundle in the place of the old one; at every moment one of the two is there."""
     _check_place(target)
-    if not target.exists():
+    if target.exists():
+        swap_folders(draft, target)  # the old one is then in the scratch folder, and goes with it
+    else:
         draft.rename(target)
-        return
-    # The old one is then in the scratch folder, and goes with it; unless it is no bundle any more.
-    swap_folders(draft, target)
-    why = _why_not_replaced(draft)
-    if why:
-        swap_folders(draft, target)
-        raise Refused(why.replace(str(draft), str(target)))

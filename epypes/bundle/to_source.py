@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, takewhile
 from typing import Any, Final
@@ -23,13 +23,11 @@ from epypes.bundle.expressions import (
 from epypes.bundle.module import module_text
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
-from epypes.graph import CompGraph, as_switch, is_placeholder
+from epypes.graph import CompGraph, as_switch
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 
-# Python itself can't indent deeper than 100; half of that can't be read.
-_DEEPEST: Final = 20
 # A longer default of a parameter is a constant above the function.
 _LONGEST: Final = 60
 _NO_EXPRESSION: Final = "is of type {kind}, and no expression makes it again. Write a plain function (def)."
@@ -37,6 +35,7 @@ _NO_VALUE: Final = (
     "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
     "numbers, strings, a small array or tuples of them."
 )
+_KEYS: Final = "Choose by strings or numbers."
 # The branches of switches in which a function stands, from outside in: each a switch and the token that is passed on.
 Region = tuple[tuple[str, str], ...]
 
@@ -103,31 +102,24 @@ def to_source(
         y = math.sqrt(x)
         return y
     """
-    if not isinstance(name, str):
-        raise TypeError(f'name is what the function is called, a string as "run_graph", not {type(name).__name__!r}.')
     graph, values = _subject(cg, hparams)
-    wanted = _wanted(graph, returns)
+    wanted = (returns,) if isinstance(returns, str) else None if returns is None else tuple(returns)
+    for token in wanted or ():
+        graph.require_token(token)
 
     def write(gathered: Slice) -> _Functions:
         functions = _Functions(gathered)
         if not is_identifier(name) or hasattr(builtins, name):
             text = f"name={name!r} can't be a function's name. Give a word that means nothing to Python."
             gathered.refusals.append(text)
-        if wanted == ():
-            text = "returns is empty: name at least one token, or leave it out for the sink tokens."
-            gathered.refusals.append(text)
         functions.write(name, graph, values, wanted)
-        if functions.placeholders:
-            raise PlaceholderNeeded(functions.placeholders)
         return functions
 
     gathered, functions = gather(write, reserved=(name,))
-    if gathered.refusals:
-        raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
     text = module_text(gathered, "\n\n\n".join(functions.texts))
-    why = functions.difference(text)
-    if why:
-        raise SourceRefused((why,))
+    reasons = [*dict.fromkeys(gathered.refusals)] or [*filter(None, [functions.difference(text)])]
+    if reasons:
+        raise SourceRefused(tuple(reasons))
     return text
 
 
@@ -138,25 +130,9 @@ def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, 
         cg, known = given.cg, runner.hyperparameters
     else:
         cg, known = given, getattr(given, "defaults", {})
-    if not isinstance(hparams, Mapping | None):
-        kind = type(hparams).__name__
-        raise TypeError(f"hparams takes the values of hyperparameters by token, such as a dict, not {kind!r}.")
     values = {**known, **(hparams or {})}
     CompGraphRunner(cg, values)  # raises for what is no graph, and for what can't be a hyperparameter
     return cg, values
-
-
-def _wanted(cg: CompGraph, returns: Any) -> tuple[str, ...] | None:
-    """Return the tokens that are asked for, which are checked; None for the sink tokens."""
-    if returns is None:
-        return None
-    wanted = (returns,) if isinstance(returns, str) else tuple(returns) if isinstance(returns, Iterable) else (None,)
-    if not all(isinstance(token, str) for token in wanted):
-        kind = type(returns).__name__
-        raise TypeError(f'returns takes a token or a list of tokens, as ["edges"], not this {kind!r}.')
-    for token in wanted:
-        cg.require_token(token)
-    return wanted
 
 
 class _Functions:
@@ -166,14 +142,11 @@ class _Functions:
     ----------
     texts
         The functions.
-    placeholders
-        What is needed and still to be written.
     """
 
     def __init__(self, gathered: Slice) -> None:
         self.gathered = gathered
         self.texts: list[str] = []
-        self.placeholders: list[str] = []
         self._compared: list[tuple[str, Any, str]] = []
         self._pipelines: dict[int, str] = {}
 
@@ -195,28 +168,19 @@ class _Functions:
         """
         returns = cg.sink_tokens if wanted is None else wanted
         regions, tokens = _regions(cg, returns, wanted is None)
-        if any(len(region) > _DEEPEST for region in regions.values()):
-            text = f"The switches{where} stand in one another too deep to be indented."
-            self.gathered.refusals.append(
-                f"{text} Make the inner ones a Pipeline, which becomes a function of its own."
-            )
-        switches = {function: self._keys(cg, function, where) for function in regions if function in set(cg.switches)}
-        calls = {function: self._call(cg, function, where) for function in regions if function not in switches}
+        missing = [function for function in cg.placeholders if function in regions]
+        if missing:
+            raise PlaceholderNeeded(missing)
+        switches = {each: self._keys(cg, each, where) for each in regions if as_switch(cg.functions[each])}
+        calls = {each: self._call(cg, each, where) for each in regions if each not in switches}
         defaults = {token: self._default(token, value, where) for token, value in values.items() if token in tokens}
-        function = _Function(name, cg, returns, regions, tokens, switches, calls, defaults, bool(where))
-        if not self.gathered.refusals:
-            self.texts.append(function.text())
+        self.texts.append(_Function(name, cg, returns, regions, tokens, switches, calls, defaults).text())
 
     def _call(self, cg: CompGraph, name: str, where: str) -> str:
         """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
-        what, function = f"Function {name!r}{where}", called_by(cg.functions[name])
-        if is_placeholder(function):
-            self.placeholders.append(name)
-            return "None"
+        function = called_by(cg.functions[name])
         if not is_plain_pipeline(function):
-            source = expression_or_none(self.gathered, function, what, _NO_EXPRESSION, name)
-            self._compared.append((what, function, source))
-            return source
+            return self._expression(f"Function {name!r}{where}", function, _NO_EXPRESSION, name)
         if id(function) not in self._pipelines:
             self._pipelines[id(function)] = inner = self.gathered.free_name(function.name)
             values = function.runner.hyperparameters
@@ -227,21 +191,19 @@ class _Functions:
         """Return the expressions of the values by which a switch chooses each token."""
         found: dict[str, list[str]] = {}
         switch = as_switch(cg.functions[name])
-        keys: Iterable[Hashable] = switch.branches if switch is not None else ()
-        for key, token in zip(keys, cg.func_inputs(name)[1:], strict=True):
-            reason = "by a key of type {kind}, which no expression makes again. Choose by strings or numbers."
-            what = f"Switch {name!r}{where}"
-            source = expression_or_none(self.gathered, key, what, f"chooses {token!r} {reason}")
-            found.setdefault(token, []).append(source)
+        for key, token in zip(switch.branches if switch else (), cg.func_inputs(name)[1:], strict=True):
+            reason = f"chooses {token!r} by a key of type {{kind}}, which no expression makes again. {_KEYS}"
+            found.setdefault(token, []).append(self._expression(f"Switch {name!r}{where}", key, reason))
         return found
 
     def _default(self, token: str, value: Any, where: str) -> str:
         """Return the expression of a hyperparameter's value: a short literal or name, or the constant that holds it."""
-        what = f"Hyperparameter {token!r}{where}"
-        source = expression_or_none(self.gathered, value, what, _NO_VALUE)
+        source = self._expression(f"Hyperparameter {token!r}{where}", value, _NO_VALUE)
         is_simple = literal_source(value) or source.replace(".", "").isidentifier()
-        if not is_simple or len(source) > _LONGEST:
-            source = self.gathered.add_constant(token.upper(), source)
+        return source if is_simple and len(source) <= _LONGEST else self.gathered.add_constant(token.upper(), source)
+
+    def _expression(self, what: str, value: Any, reason: str, wanted: str = "") -> str:
+        source = expression_or_none(self.gathered, value, what, reason, wanted)
         self._compared.append((what, value, source))
         return source
 
@@ -304,8 +266,6 @@ class _Function:
         By function, the expression that refers to it.
     defaults
         By hyperparameter, the expression of its value.
-    is_inner
-        Whether it is a function of another graph, which returns a value even if there is no token to return.
     """
 
     name: str
@@ -316,7 +276,6 @@ class _Function:
     switches: Mapping[str, Mapping[str, Sequence[str]]]
     calls: Mapping[str, str]
     defaults: Mapping[str, str]
-    is_inner: bool
     _variables: dict[str, str] = field(default_factory=dict)
 
     def text(self) -> str:
@@ -329,9 +288,9 @@ class _Function:
         head = f"def {self.name}({', '.join(given)}):"
         lines = [head] if len(head) <= LINE else [f"def {self.name}(", *(f"    {each}," for each in given), "):"]
         lines += [*self._docstring([*sources, *self.returns]), *self._lines(())]
-        if self.returns or self.is_inner:
-            returned = ", ".join(variables[token] for token in self.returns) or "()"
-            is_line = len(self.returns) < 2 or len(returned) + len("    return ") <= LINE
+        returned = ", ".join(variables[token] for token in self.returns)
+        if returned:
+            is_line = len(self.returns) == 1 or len(returned) + len("    return ") <= LINE
             lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")
         return "\n".join(lines)
 
@@ -366,11 +325,9 @@ class _Function:
         depth, pad, keyword = len(region) + 1, "    " * (len(region) + 1), "if"
         selector, targets = self._variables[self.cg.func_inputs(name)[0]], self._targets(name)
         for token, keys in self.switches[name].items():
-            if len(keys) == 1 and keys[0] not in ("None", "True", "False"):
-                operator, right = "==", keys[0]
-            else:
-                operator, right = "in", f"({', '.join(keys)}{',' if len(keys) == 1 else ''})"
-            yield from laid_out(right, depth, f"{keyword} {selector} {operator} ", ":")
+            is_one = len(keys) == 1 and keys[0] not in ("None", "True", "False")
+            right = keys[0] if is_one else f"({', '.join(keys)},)"
+            yield from laid_out(right, depth, f"{keyword} {selector} {'==' if is_one else 'in'} ", ":")
             body = [*self._lines((*region, (name, token)))]
             body += laid_out(self._variables[token], depth + 1, targets) if targets else []
             yield from body or [f"{pad}    pass"]

@@ -151,15 +151,6 @@ def test_two_functions_with_one_array_share_its_file(tmp_path):
     assert [path.name for path in (bundle.path / "arrays").iterdir()] == ["T.npy"]
 
 
-def test_arrays_beyond_what_a_bundle_keeps_are_refused_with_a_way_out(tmp_path):
-    source = "import numpy as np\nBIG = np.zeros((2100, 1000))\ndef match(image):\n    return image + BIG[0, 0]\n"
-    with pytest.raises(PromotionRefused) as caught:
-        ep.promote(runner_of(source)[0], tmp_path / "bundle")
-    (reason,) = caught.value.reasons
-    assert "16.8 MB; 16 MB are the most" in reason
-    assert "Pass it in as a token" in reason
-
-
 def test_a_large_array_in_a_hyperparameter_is_refused_and_its_way_out_works(tmp_path):
     value = {"coin": IMAGE[:40, :40]}
     use = cell("def use(image, template, method):\n    return image + template['coin'].max()\n")["use"]
