@@ -309,6 +309,8 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         return float, (repr(value),)
     if kind is frozenset:
         return frozenset, (set(value),) if value else ()
+    if kind is range and value.step == 1:
+        return range, (value.start, value.stop)
     if kind is re.Pattern:  # the flag for text is what re.compile adds by itself
         flags = re.RegexFlag(value.flags & ~re.UNICODE)
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)

@@ -71,39 +71,35 @@ def write_module(
     enums = {type(member).__qualname__: type(member) for member in members if isinstance(member, enum.Enum)}
     own = {MAKER: pipeline is not None, "enums": bool(enums), "func_groups": settings.has_groups}
 
-    def write(gathered: Slice) -> tuple[dict[str, str], list[str], list[str]]:
-        graphs, behind = Graphs(gathered), list[str]()
+    def write(gathered: Slice) -> dict[str, str]:
+        graphs, definitions = Graphs(gathered), gathered.definitions
         references = graphs.write(cg)
         for name, port in ports.items():
             reference = graphs.value(port, f"Function {name!r}", name)
             if reference != name:
                 with gathered.noted_refusals():
                     gathered.reserve(name)
-                behind.append(f"{_PORTS[name]}\n{name} = {reference}")
+                definitions[name] = f"{_PORTS[name]}\n{name} = {reference}"
         if pipeline is not None:
             with gathered.noted_refusals():
-                graphs.write_maker(pipeline)
+                definitions[MAKER] = graphs.maker(pipeline)
         kinds = {name: graphs.value(kind, f"Class {name!r} of a hyperparameter", name) for name, kind in enums.items()}
         if kinds:
-            behind.append(f"# Whose members stand in pipeline.toml.\n{_assigned('enums', kinds)}")
-        return references, graphs.blocks, behind
+            definitions["enums"] = f"# Whose members stand in pipeline.toml.\n{_dict('enums', kinds)}"
+        return references
 
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
-    gathered, (references, before, behind) = gather(write, reserved, stores_arrays=True)
+    gathered, references = gather(write, reserved, stores_arrays=True)
     if gathered.refusals:
         return "", {}, list(dict.fromkeys(gathered.refusals))
     arrays = {f"{ARRAYS}/{name}.npy": array for name, array in gathered.arrays.items()}
-    module = emit_module(settings, cg, gathered, references, before, behind)
+    module = emit_module(settings, cg, gathered, references)
     why = refusal(module, arrays, functools.partial(_pairs, cg, ports, pipeline, enums))
     return module, arrays, [why] if why else []
 
 
 def _pairs(
-    cg: CompGraph,
-    ports: Mapping[str, Any],
-    pipeline: Pipeline | None,
-    enums: Mapping[str, type],
-    module: Any,
+    cg: CompGraph, ports: Mapping[str, Any], pipeline: Pipeline | None, enums: Mapping[str, type], module: Any
 ) -> Iterator[Pair]:
     """Give what of the notebook is compared with the module, by how a reason calls it."""
     for name, function in cg.functions.items():
@@ -121,14 +117,7 @@ def _pairs(
             yield f"Class of pipeline {pipeline.name!r}", type(pipeline), type(made).__bases__[1]
 
 
-def emit_module(
-    settings: Settings,
-    cg: CompGraph,
-    needed: Slice,
-    references: Mapping[str, str],
-    before: Sequence[str] = (),
-    behind: Sequence[str] = (),
-) -> str:
+def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Mapping[str, str]) -> str:
     """Return the text of ``pipeline.py``.
 
     Parameters
@@ -138,13 +127,9 @@ def emit_module(
     cg
         The graph.
     needed
-        What its functions need.
+        What its functions need, and what the bundle has of its own.
     references
         By function the expression that refers to it.
-    before
-        What stands before the graph: switches, nodes and pipelines that are functions of it.
-    behind
-        What stands behind it: what the bundle has of its own.
     """
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
     title = escaped(f"The computational graph {settings.name}: {ends}.", LINE - len('"""'))
@@ -152,14 +137,14 @@ def emit_module(
     if not all(token.isidentifier() for token in settings.inputs) or len(run) > LINE:
         run = "    runner.run(**payload)"
     head = _TEXT.format(title=title, run=run)
-    blocks = [*before, _assigned("func_dict", references), _io("func_io", cg)]
+    blocks = [_dict("func_dict", references), _io("func_io", cg)]
     if cg.groups:
         groups = {name: bracketed([*part], quoted) for name, part in cg.groups.items()}
-        blocks.append(f"# Drawn as one box each.\n{_assigned('func_groups', groups)}")
-    return module_text(needed, "\n\n".join([*blocks, *behind]), head)
+        blocks.append(f"# Drawn as one box each.\n{_dict('func_groups', groups)}")
+    return module_text(needed, "\n\n".join(blocks), head)
 
 
-def _assigned(variable: str, items: Mapping[str, str]) -> str:
+def _dict(variable: str, items: Mapping[str, str]) -> str:
     """Return the lines of a dict that has a variable."""
     inner = ", ".join(f"{quoted(name)}: {source}" for name, source in items.items())
     return "\n".join(laid_out(f"{{{inner}}}", before=f"{variable} = ", is_broken=True))
@@ -173,26 +158,20 @@ def _io(variable: str, cg: CompGraph) -> str:
             return "None" if tokens is None else quoted(tokens)
         return bracketed(tuple(tokens), quoted)
 
-    return _assigned(variable, {name: bracketed(tuple(sides), side) for name, sides in cg.func_io.items()})
+    return _dict(variable, {name: bracketed(tuple(sides), side) for name, sides in cg.func_io.items()})
 
 
 class Graphs:
-    """Writes a graph, and before it the graphs of pipelines and all else that its functions are made of.
+    """Writes a graph; its nodes, switches and the graphs of its pipelines become definitions of the module.
 
     Parameters
     ----------
     gathered
         The module that it is for; is added to.
-
-    Attributes
-    ----------
-    blocks
-        What stands between the functions and the graph, in order.
     """
 
     def __init__(self, gathered: Slice) -> None:
         self.gathered = gathered
-        self.blocks: list[str] = []
         self._made: dict[int, str] = {}
 
     def write(self, cg: CompGraph, where: str = "") -> dict[str, str]:
@@ -229,7 +208,7 @@ class Graphs:
 
     def _variable(self, name: str, source: str, comment: str = "") -> str:
         variable = self.gathered.free_name(name)
-        self.blocks.append("\n".join([*filter(None, [comment]), *laid_out(source, before=f"{variable} = ")]))
+        self.gathered.definitions[variable] = comment + "\n".join(laid_out(source, before=f"{variable} = "))
         return variable
 
     def _switch(self, cg: CompGraph, name: str, switch: Switch, what: str) -> str:
@@ -239,7 +218,7 @@ class Graphs:
         output = quoted(cg.func_outputs(name)[0])
         epypes = self.gathered.module_name("epypes", what)
         made = f"{epypes}.switch({quoted(name)}, {{{branches}}}, by={quoted(by)}, output={output})"
-        variable = self._variable(name, made, f"# Only the branch that {escaped(by, 80)} chooses is computed.")
+        variable = self._variable(name, made, f"# Only the branch that {escaped(by, 80)} chooses is computed.\n")
         return f"{variable}.functions[{quoted(name)}]"
 
     def _arguments(self, made: Node, what: str, name: str, besides: Sequence[str] = ()) -> list[str]:
@@ -258,15 +237,16 @@ class Graphs:
         variables = self.gathered.free_name(f"{name}_functions"), self.gathered.free_name(f"{name}_io")
         ends = f"{', '.join(cg.source_tokens) or 'nothing'} -> {', '.join(cg.sink_tokens) or 'nothing'}"
         comment = f"# {escaped(f'A graph of its own: {ends}.', 80)}"
-        self.blocks.append("\n".join([comment, _assigned(variables[0], references), _io(variables[1], cg)]))
+        self.gathered.definitions[variables[0]] = f"{comment}\n{_dict(variables[0], references)}"
+        self.gathered.definitions[variables[1]] = _io(variables[1], cg)
         epypes = self.gathered.module_name("epypes", what)
         source = f"{epypes}.CompGraph({', '.join(variables)}{'' if cg.types else ', types=False'})"
         for group, members in cg.groups.items():
             source = f"{epypes}.group({source}, {quoted(group)}, functions={bracketed([*members], quoted)})"
         return source
 
-    def write_maker(self, pipeline: Pipeline) -> None:
-        """Write the function that makes the pipeline of a user's class; of one that takes no events, one that does.
+    def maker(self, pipeline: Pipeline) -> str:
+        """Return the function that makes the pipeline of a user's class; of one that takes no events, one that does.
 
         Raises
         ------
@@ -291,7 +271,7 @@ class Graphs:
         arguments += [f"{name}={name}" for name in _GIVEN if name in taken]
         head = [f"def {MAKER}({', '.join(_GIVEN)}):", '    """Return the pipeline that answers events."""']
         made = laid_out(f"{known}({', '.join(arguments)})", 1, "return ")
-        self.gathered.definitions[MAKER] = "\n".join([*head, *made])
+        return "\n".join([*head, *made])
 
 
 def _class_of(made: Node, what: str) -> str:

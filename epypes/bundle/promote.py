@@ -21,13 +21,7 @@ from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.proof import draft_folder, prove, swap_folders
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import (
-    Settings,
-    store_arrays,
-    unwritable,
-    writable_defaults,
-    write_settings,
-)
+from epypes.bundle.settings import Settings, store_arrays, unwritable, writable_defaults, write_settings
 from epypes.errors import EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import colour_order
 from epypes.pipeline import Pipeline

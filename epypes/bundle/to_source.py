@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import chain, takewhile
 from typing import Any, Final
 
@@ -12,6 +11,7 @@ from epypes.bundle.clone import called_by, is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import (
     LINE,
+    bracketed,
     escaped,
     expression_or_none,
     identifier_of,
@@ -23,10 +23,9 @@ from epypes.bundle.expressions import (
 from epypes.bundle.module import module_text
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
-from epypes.graph import CompGraph, as_switch
+from epypes.graph import CompGraph, Switch, as_switch
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
-from epypes.wording import counted
 
 # A longer default of a parameter is a constant above the function.
 _LONGEST: Final = 60
@@ -35,7 +34,7 @@ _NO_VALUE: Final = (
     "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
     "numbers, strings, a small array or tuples of them."
 )
-_KEYS: Final = "Choose by strings or numbers."
+_NO_KEY: Final = "by a key of type {kind}, which no expression makes again. Choose by strings or numbers."
 # The branches of switches in which a function stands, from outside in: each a switch and the token that is passed on.
 Region = tuple[tuple[str, str], ...]
 
@@ -107,17 +106,17 @@ def to_source(
     for token in wanted or ():
         graph.require_token(token)
 
-    def write(gathered: Slice) -> _Functions:
-        functions = _Functions(gathered)
+    def write(gathered: Slice) -> _Module:
+        module = _Module(gathered)
         if not is_identifier(name) or hasattr(builtins, name):
             text = f"name={name!r} can't be a function's name. Give a word that means nothing to Python."
             gathered.refusals.append(text)
-        functions.write(name, graph, values, wanted)
-        return functions
+        _Function(module, name, graph, values, wanted)
+        return module
 
-    gathered, functions = gather(write, reserved=(name,))
-    text = module_text(gathered, "\n\n\n".join(functions.texts))
-    reasons = [*dict.fromkeys(gathered.refusals)] or [*filter(None, [functions.difference(text)])]
+    gathered, module = gather(write, reserved=(name,))
+    text = module_text(gathered, "\n\n\n".join(module.texts))
+    reasons = [*dict.fromkeys(gathered.refusals)] or [*filter(None, [module.difference(text)])]
     if reasons:
         raise SourceRefused(tuple(reasons))
     return text
@@ -135,84 +134,39 @@ def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, 
     return cg, values
 
 
-class _Functions:
-    """The functions that a graph becomes: one for each pipeline in it, then its own.
+class _Module:
+    """The module that a graph becomes.
 
     Attributes
     ----------
+    gathered
+        What its functions need.
     texts
-        The functions.
+        The functions: one for each pipeline in the graph, then its own.
+    pipelines
+        The names of the functions of pipelines, by id.
+    compared
+        What is compared with the notebook: how reasons call it, the value, its expression.
     """
 
     def __init__(self, gathered: Slice) -> None:
         self.gathered = gathered
         self.texts: list[str] = []
-        self._compared: list[tuple[str, Any, str]] = []
-        self._pipelines: dict[int, str] = {}
+        self.pipelines: dict[int, str] = {}
+        self.compared: list[tuple[str, Any, str]] = []
 
-    def write(
-        self, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: tuple[str, ...] | None, where: str = ""
-    ) -> None:
-        """Write a graph as a function, behind those of its pipelines; refusals are gathered.
-
-        Parameters
-        ----------
-        name
-            What the function is called.
-        cg, values
-            The graph, and the values of its hyperparameters.
-        wanted
-            The tokens that it returns; None for the sink tokens, and all functions.
-        where
-            How reasons call a pipeline; "" for the graph that was given.
-        """
-        returns = cg.sink_tokens if wanted is None else wanted
-        regions, tokens = _regions(cg, returns, wanted is None)
-        missing = [function for function in cg.placeholders if function in regions]
-        if missing:
-            raise PlaceholderNeeded(missing)
-        switches = {each: self._keys(cg, each, where) for each in regions if as_switch(cg.functions[each])}
-        calls = {each: self._call(cg, each, where) for each in regions if each not in switches}
-        defaults = {token: self._default(token, value, where) for token, value in values.items() if token in tokens}
-        self.texts.append(_Function(name, cg, returns, regions, tokens, switches, calls, defaults).text())
-
-    def _call(self, cg: CompGraph, name: str, where: str) -> str:
-        """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
-        function = called_by(cg.functions[name])
-        if not is_plain_pipeline(function):
-            return self._expression(f"Function {name!r}{where}", function, _NO_EXPRESSION, name)
-        if id(function) not in self._pipelines:
-            self._pipelines[id(function)] = inner = self.gathered.free_name(function.name)
-            values = function.runner.hyperparameters
-            self.write(inner, function.cg, values, None, f" of pipeline {function.name!r}")
-        return self._pipelines[id(function)]
-
-    def _keys(self, cg: CompGraph, name: str, where: str) -> dict[str, list[str]]:
-        """Return the expressions of the values by which a switch chooses each token."""
-        found: dict[str, list[str]] = {}
-        switch = as_switch(cg.functions[name])
-        for key, token in zip(switch.branches if switch else (), cg.func_inputs(name)[1:], strict=True):
-            reason = f"chooses {token!r} by a key of type {{kind}}, which no expression makes again. {_KEYS}"
-            found.setdefault(token, []).append(self._expression(f"Switch {name!r}{where}", key, reason))
-        return found
-
-    def _default(self, token: str, value: Any, where: str) -> str:
-        """Return the expression of a hyperparameter's value: a short literal or name, or the constant that holds it."""
-        source = self._expression(f"Hyperparameter {token!r}{where}", value, _NO_VALUE)
-        is_simple = literal_source(value) or source.replace(".", "").isidentifier()
-        return source if is_simple and len(source) <= _LONGEST else self.gathered.add_constant(token.upper(), source)
-
-    def _expression(self, what: str, value: Any, reason: str, wanted: str = "") -> str:
+    def expression(self, what: str, value: Any, reason: str, wanted: str = "") -> str:
+        """Return the expression of a value that is compared; refusals are gathered."""
         source = expression_or_none(self.gathered, value, what, reason, wanted)
-        self._compared.append((what, value, source))
+        self.compared.append((what, value, source))
         return source
 
     def difference(self, text: str) -> str:
         """Return why what a module calls is not what the graph calls; "" if it is."""
-        sources = ", ".join(source for _, _, source in self._compared)
+        sources = ", ".join(source for _, _, source in self.compared)
 
         def pairs(module: Any) -> list[Pair]:
-            return [(what, ours, made) for (what, ours, _), made in zip(self._compared, module.references, strict=True)]
+            return [(what, ours, made) for (what, ours, _), made in zip(self.compared, module.references, strict=True)]
 
         return refusal(f"{text}references = [{sources}]\n", {}, pairs)
 
@@ -245,42 +199,85 @@ def _common(regions: Sequence[Region]) -> Region:
     return tuple(level[0] for level in levels)
 
 
-@dataclass(slots=True)
 class _Function:
-    """A graph as the text of a function.
+    """A graph as a function, which is written into a module behind those of its pipelines.
 
     A function that only one branch of a switch needs stands inside it, so that it runs only when that branch is chosen.
     What several branches need stands before the switch.
 
+    Parameters
+    ----------
+    module
+        The module; is added to.
+    name
+        What the function is called.
+    cg, values
+        The graph, and the values of its hyperparameters.
+    wanted
+        The tokens that it returns; None for the sink tokens, and all functions.
+    where
+        How reasons call a pipeline; "" for the graph that was given.
+
     Attributes
     ----------
-    name
-        What it is called.
-    cg, returns
-        The graph, and the tokens that the function returns.
-    regions, tokens
-        Where each function stands, and the tokens that have a variable.
+    regions
+        Where each function stands.
     switches
         By switch and token, the expressions of the values that choose it.
     calls
         By function, the expression that refers to it.
     defaults
         By hyperparameter, the expression of its value.
+    variables
+        By token.
     """
 
-    name: str
-    cg: CompGraph
-    returns: Sequence[str]
-    regions: Mapping[str, Region]
-    tokens: Sequence[str]
-    switches: Mapping[str, Mapping[str, Sequence[str]]]
-    calls: Mapping[str, str]
-    defaults: Mapping[str, str]
-    _variables: dict[str, str] = field(default_factory=dict)
+    def __init__(
+        self, module: _Module, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: Any, where: str = ""
+    ) -> None:
+        self.module, self.name, self.cg, self.where = module, name, cg, where
+        self.returns = cg.sink_tokens if wanted is None else wanted
+        self.regions, tokens = _regions(cg, self.returns, wanted is None)
+        missing = [each for each in cg.placeholders if each in self.regions]
+        if missing:
+            raise PlaceholderNeeded(missing)
+        switches = {each: as_switch(cg.functions[each]) for each in self.regions}
+        self.switches = {each: self._keys(each, switch) for each, switch in switches.items() if switch is not None}
+        self.calls = {each: self._call(each) for each in self.regions if each not in self.switches}
+        self.defaults = {token: self._default(token, value) for token, value in values.items() if token in tokens}
+        self.variables = self._named(tokens)
+        module.texts.append(self._text())
 
-    def text(self) -> str:
+    def _call(self, name: str) -> str:
+        """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
+        module, function = self.module, called_by(self.cg.functions[name])
+        if not is_plain_pipeline(function):
+            return module.expression(f"Function {name!r}{self.where}", function, _NO_EXPRESSION, name)
+        if id(function) not in module.pipelines:
+            module.pipelines[id(function)] = inner = module.gathered.free_name(function.name)
+            where = f" of pipeline {function.name!r}"
+            _Function(module, inner, function.cg, function.runner.hyperparameters, None, where)
+        return module.pipelines[id(function)]
+
+    def _keys(self, name: str, switch: Switch) -> dict[str, list[str]]:
+        """Return the expressions of the values by which a switch chooses each token."""
+        found: dict[str, list[str]] = {}
+        for key, token in zip(switch.branches, self.cg.func_inputs(name)[1:], strict=True):
+            source = self.module.expression(f"Switch {name!r}{self.where} chooses {token!r}", key, _NO_KEY)
+            found.setdefault(token, []).append(source)
+        return found
+
+    def _default(self, token: str, value: Any) -> str:
+        """Return the expression of a hyperparameter's value: a short literal or name, or the constant that holds it."""
+        source = self.module.expression(f"Hyperparameter {token!r}{self.where}", value, _NO_VALUE)
+        is_simple = literal_source(value) or source.replace(".", "").isidentifier()
+        if is_simple and len(source) <= _LONGEST:
+            return source
+        return self.module.gathered.add_constant(token.upper(), source)
+
+    def _text(self) -> str:
         """Return the function."""
-        self._variables = variables = self._named()
+        variables = self.variables
         sources = [token for token in self.cg.source_tokens if token in variables]
         given = [variables[token] for token in sources if token not in self.defaults]
         named = [f"{variables[token]}={self.defaults[token]}" for token in sources if token in self.defaults]
@@ -294,12 +291,12 @@ class _Function:
             lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")
         return "\n".join(lines)
 
-    def _named(self) -> dict[str, str]:
+    def _named(self, tokens: Iterable[str]) -> dict[str, str]:
         """Return a variable for each token that hides nothing of the module; names that can stay come first."""
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
         taken = {name for source in [*self.calls.values(), *keys] for name in names_in(source)} | {"ValueError"}
         found: dict[str, str] = {}
-        for token in sorted(self.tokens, key=lambda token: not is_identifier(token) or token in taken):
+        for token in sorted(tokens, key=lambda token: not is_identifier(token) or token in taken):
             found[token] = identifier_of(token, taken.__contains__)
             taken.add(found[token])
         return found
@@ -310,12 +307,12 @@ class _Function:
             if name in self.switches:
                 yield from self._switch(name, region)
             else:
-                arguments = ", ".join(self._variables[token] for token in self.cg.func_inputs(name))
+                arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
                 yield from laid_out(f"{self.calls[name]}({arguments})", len(region) + 1, self._targets(name))
 
     def _targets(self, name: str) -> str:
         """Return what stands before the value of a function."""
-        targets = [self._variables[token] for token in self.cg.func_outputs(name)]
+        targets = [self.variables[token] for token in self.cg.func_outputs(name)]
         if not targets:
             return ""
         is_tuple_of_one = len(targets) == 1 and not self.cg.has_single_output(name)
@@ -323,13 +320,13 @@ class _Function:
 
     def _switch(self, name: str, region: Region) -> Iterator[str]:
         depth, pad, keyword = len(region) + 1, "    " * (len(region) + 1), "if"
-        selector, targets = self._variables[self.cg.func_inputs(name)[0]], self._targets(name)
+        selector, targets = self.variables[self.cg.func_inputs(name)[0]], self._targets(name)
         for token, keys in self.switches[name].items():
             is_one = len(keys) == 1 and keys[0] not in ("None", "True", "False")
-            right = keys[0] if is_one else f"({', '.join(keys)},)"
+            right = keys[0] if is_one else bracketed(tuple(keys), str)
             yield from laid_out(right, depth, f"{keyword} {selector} {'==' if is_one else 'in'} ", ":")
             body = [*self._lines((*region, (name, token)))]
-            body += laid_out(self._variables[token], depth + 1, targets) if targets else []
+            body += laid_out(self.variables[token], depth + 1, targets) if targets else []
             yield from body or [f"{pad}    pass"]
             keyword = "elif"
         yield f"{pad}else:"
@@ -337,12 +334,12 @@ class _Function:
 
     def _docstring(self, shown: Iterable[str]) -> list[str]:
         """Return the docstring: what is returned, and which parameters and results have other names than tokens."""
-        returned = ", ".join(self._variables[token] for token in self.returns)
+        returned = ", ".join(self.variables[token] for token in self.returns)
         if len(returned) > LINE - len('    """Return ."""'):
-            returned = counted(len(self.returns), "value")
+            returned = f"{len(self.returns)} values"
         summary = f"Return {returned}." if returned else "Run."
-        other = [token for token in dict.fromkeys(shown) if self._variables[token] != token]
+        other = [token for token in dict.fromkeys(shown) if self.variables[token] != token]
         if not other:
             return [f'    """{summary}"""']
-        lines = [f"        {self._variables[token]}: '{escaped(token, 40)}'" for token in other]
+        lines = [f"        {self.variables[token]}: '{escaped(token, 40)}'" for token in other]
         return [f'    """{summary}', "", "    Tokens of the graph that have other names here:", "", *lines, '    """']
