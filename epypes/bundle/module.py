@@ -254,10 +254,8 @@ class Graphs:
             A service can't make it, or can't give it events.
         """
         kind, what = type(pipeline), f"Pipeline {pipeline.name!r}"
-        known, taken = (
-            self.gathered.add_class(kind, _class_of(pipeline, what)),
-            [one.name for one in parameters_of(kind)],
-        )
+        known = self.gathered.add_class(kind, _class_of(pipeline, what))
+        taken = [parameter.name for parameter in parameters_of(kind)]
         of_user = {name for above in kind.__mro__ if above not in FullPipeline.__mro__ for name in vars(above)}
         if not isinstance(pipeline, FullPipeline | SourcePipeline) and not of_user & {"__init__", "emit"}:
             full = f"{self.gathered.module_name('epypes', what)}.FullPipeline"

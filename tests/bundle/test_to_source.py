@@ -227,6 +227,18 @@ def test_names_that_hide_nothing_and_mean_nothing_to_python_are_kept():
     assert executed(text)(16.0, 3) == 4.0
 
 
+def test_a_variable_does_not_hide_what_a_partial_calls():
+    names = notebook("def scale(x, by):\n    return x * by\nthrice = functools.partial(scale, by=3)\n")
+    text = ep.to_source(ep.CompGraph({"f": names["thrice"]}, {"f": ("scale", "y")}))
+    assert executed(text)(2) == 6
+
+
+def test_a_long_value_is_a_constant_above_the_function():
+    text = source_with([*range(60)])
+    assert text.startswith("K = [\n    0,\n")
+    assert "\n\n\ndef run_graph(*, k=K):\n" in text
+
+
 def test_outputs_are_written_as_the_graph_takes_them():
     LOGGED.clear()
     cg = ep.CompGraph(
