@@ -132,7 +132,8 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
         By function the expression that refers to it.
     """
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
-    title = escaped(f"The computational graph {settings.name}: {ends}.", LINE - len('"""'))
+    titles = [escaped(f"The computational graph {settings.name}{more}.") for more in (f": {ends}", "")]
+    title = titles[len(titles[0]) > LINE - len('"""')]
     run = f"    runner.{run_call(settings.inputs)}"
     if not all(token.isidentifier() for token in settings.inputs) or len(run) > LINE:
         run = "    runner.run(**payload)"

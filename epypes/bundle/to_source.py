@@ -294,7 +294,7 @@ class _Function:
     def _named(self, tokens: Iterable[str]) -> dict[str, str]:
         """Return a variable for each token that hides nothing of the module; names that can stay come first."""
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
-        taken = {name for source in [*self.calls.values(), *keys] for name in names_in(source)} | {"ValueError"}
+        taken = {name for source in {*self.calls.values(), *keys} for name in names_in(source)} | {"ValueError"}
         found: dict[str, str] = {}
         for token in sorted(tokens, key=lambda token: not is_identifier(token) or token in taken):
             found[token] = identifier_of(token, taken.__contains__)
