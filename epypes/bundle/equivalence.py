@@ -31,9 +31,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.clone import is_set_elsewhere
 from epypes.bundle.definitions import annotated_names, defaults_of, statements_of_class
 from epypes.bundle.expressions import has_steady_order, is_data, is_same_data, write_arrays
-from epypes.bundle.graphs import is_set_elsewhere
 from epypes.bundle.load import MODULE, execute
 from epypes.bundle.notebook_source import (
     computes_the_same,

@@ -9,13 +9,13 @@ from __future__ import annotations
 import ast
 import dataclasses
 import enum
+import inspect
 import itertools
 import json
 import keyword
 import logging
 import pathlib
 import re
-import sys
 import types
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping
@@ -47,28 +47,14 @@ def is_identifier(text: str) -> bool:
     return is_usable and unicodedata.normalize("NFKC", text) == text
 
 
-def identifiers_of(names: Iterable[str], is_taken: Callable[[str], bool]) -> dict[str, str]:
-    """Return a variable for each name, each its own; names that can stay as they are come first."""
-    names = list(names)
-    found = {name: str.__str__(name) for name in names if is_identifier(name) and not is_taken(name)}
-    used = set(found.values())
-    for name in names:
-        if name not in found:
-            found[name] = identifier_of(name, lambda text: text in used or is_taken(text))
-            used.add(found[name])
-    return found
-
-
 def identifier_of(name: str, is_taken: Callable[[str], bool]) -> str:
     """Return a variable that is not taken, as like a name as can be."""
     stem = str.__str__(name)
-    if not is_identifier(name):
-        stem = re.sub(r"\W+", "_", name.encode("ascii", "ignore").decode())[:_LONGEST].strip("_") or "token"
+    if not is_identifier(stem):
+        stem = re.sub(r"\W+", "_", stem.encode("ascii", "ignore").decode())[:_LONGEST].strip("_") or "token"
         stem = f"token_{stem}" if stem[0].isdecimal() else stem
-    if is_identifier(stem) and not is_taken(stem):
-        return stem
-    numbered = (f"{stem}_{number}" for number in itertools.count(2))
-    return next(text for text in itertools.chain([f"{stem}_"], numbered) if not is_taken(text))
+    candidates = itertools.chain([stem, f"{stem}_"], (f"{stem}_{number}" for number in itertools.count(2)))
+    return next(text for text in candidates if is_identifier(text) and not is_taken(text))
 
 
 # -- literals ----------------------------------------------------------------------------------------------------------
@@ -133,11 +119,10 @@ def literal_source(value: Any) -> str:
     """Return the literal of this very value; "" if there is none."""
     try:
         source = literal(value)
-        read = ast.literal_eval(source)
+        # By source: 0j == -0j, but they are not the same.
+        return source if is_same_data(ast.literal_eval(source), value) else ""
     except (ValueError, SyntaxError, RecursionError, MemoryError):  # Python writes no int of 5000 digits, for one
         return ""
-    # By source: 0j == -0j, but they are not the same.
-    return source if type(read) is type(value) and literal(read) == source else ""
 
 
 def is_same_data(written: Any, value: Any) -> bool:
@@ -159,10 +144,13 @@ def literal_value(expression: ast.expr) -> Any:
 # -- expressions -------------------------------------------------------------------------------------------------------
 
 # Their objects know the call that makes them.
-_KNOW_THEIR_CALL: Final = (itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal, logging.Logger)
+_KNOW_THEIR_CALL: Final = (
+    range, slice, itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal, logging.Logger,
+)  # fmt: skip
 # More numbers are too many to read.
 _MOST_NUMBERS: Final = 200
 _MOST_CHARACTERS: Final = 400
+_ARRAY: Final = re.compile(r'array\(.*?"\)')
 
 
 def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
@@ -173,8 +161,8 @@ def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
     gathered
         The module that it is for; is added to.
     value
-        A literal, a small array, a number of NumPy's, a member of an enumeration, a function or class, a simple object
-        such as a range or an itemgetter, or a tuple, list or dict of these.
+        A literal, an array, a number of NumPy's, a member of an enumeration, a named tuple, a dataclass's object, a
+        function or class, a simple object such as a range or an itemgetter, or a tuple, list or dict of these.
     what
         How to call it in a reason.
     wanted
@@ -191,16 +179,16 @@ def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
         return ""
 
 
-def expression_or_none(gathered: Slice, value: Any, what: str, reason: str = "", wanted: str = "") -> str:
+def expression_or_none(gathered: Slice, value: Any, what: str, reason: str, wanted: str = "") -> str:
     """Return the expression of a value; "None", with a reason noted in the slice, if there is none.
 
     ``reason`` is what stands behind ``what`` then; ``{kind}`` in it is the type of the value.
     """
     with gathered.noted_refusals():
         source = expression(gathered, value, what, wanted)
-        if not source:
-            raise Refused(f"{what} {reason.replace('{kind}', type(value).__name__)}")
-        return source
+        if source:
+            return source
+        gathered.refusals.append(f"{what} {reason.replace('{kind}', type(value).__name__)}")
     return "None"
 
 
@@ -233,12 +221,11 @@ class _Writer:
             return source
         if type(value) in (tuple, list, dict):
             return bracketed(value, self.write)
-        made_by, arguments = _call_of(value)
-        if made_by is not None:
+        call = _call_of(value)
+        if call is not None:
+            made_by, arguments = call
             return f"{self.write(made_by)}({self._joined(arguments)})"
-        if is_plain_array(value):
-            return self._array(value)
-        made = self._record(value) or self._object(value)
+        made = self._array(value) if is_plain_array(value) else self._record(value) or self._object(value)
         if not made:
             raise ValueError(f"no expression makes an object of class {type(value).__name__!r}")
         return made
@@ -272,84 +259,80 @@ class _Writer:
         if isinstance(value, enum.Enum):
             if isinstance(value, enum.Flag) and value.name not in kind.__members__:
                 return " | ".join(map(self.write, value))
-            return f"{self.gathered.add_class(kind, what)}.{value.name}" if value.name in kind.__members__ else ""
-        if dataclasses.is_dataclass(kind):
-            names = [field.name for field in dataclasses.fields(kind)]
-            is_record = all(field.init for field in dataclasses.fields(kind))
-            defaults = {field.name: field.default for field in dataclasses.fields(kind)}
-        else:
-            names, is_record = [*getattr(kind, "_fields", ())], isinstance(value, tuple) and hasattr(kind, "_fields")
-            defaults = getattr(kind, "_field_defaults", {})
-        if not is_record:
+            return f"{self.gathered.add_class(kind, what)}.{value.name}"
+        if not dataclasses.is_dataclass(kind) and not (isinstance(value, tuple) and hasattr(kind, "_fields")):
             return ""
-        parts = {name: getattr(value, name) for name in names}
-        needed = [name for name in names if not is_same_data(parts[name], defaults.get(name, UNKNOWN))]
+        defaults = {name: one.default for name, one in inspect.signature(kind).parameters.items()}
+        parts = {name: getattr(value, name, UNKNOWN) for name in defaults}
+        needed = [name for name, part in parts.items() if not is_same_data(part, defaults[name])]
         given = ", ".join(f"{name}={self.write(parts[name])}" for name in needed)
         return f"{self.gathered.add_class(kind, what)}({given})"
 
     def _array(self, array: Any) -> str:
         """Return the expression of an array: its numbers if they are few, else the call that reads it from a file."""
-        text = self._numbers(array)
-        if (text and len(text) <= _MOST_CHARACTERS) or not self.gathered.stores_arrays:
-            return text
-        return _stored(self.gathered, array, self.what, self.wanted) if array.dtype.kind in "biufc" else ""
+        source = ""
+        # No list has the shape of a matrix without numbers.
+        is_small = array.size <= _MOST_NUMBERS and (array.size > 0 or array.ndim == 1)
+        listed = literal_source(array.tolist()) if is_small and array.dtype.kind in "biufc" else ""
+        if listed:
+            if not array.flags.c_contiguous and not array.flags.f_contiguous:
+                raise Refused(
+                    f"{self.what} has an array that is a view of another, with gaps or reversed, which would be laid "
+                    "out otherwise. Make it a whole one in the notebook: np.ascontiguousarray(...)."
+                )
+            order = "" if array.flags.c_contiguous else ', order="F"'
+            numpy = self.gathered.module_name("numpy", self.what)
+            source = f'{numpy}.array({listed}, dtype="{array.dtype}"{order})'
+        if (source and len(source) <= _MOST_CHARACTERS) or not self.gathered.stores_arrays:
+            return source
+        return self._stored_array(array) if array.dtype.kind in "biufc" else ""
 
-    def _numbers(self, array: Any) -> str:
-        """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
-        import numpy as np
-
-        if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8 or array.size > _MOST_NUMBERS:
-            return ""
-        listed = repr(array.tolist())
-        if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
-            return ""
-        if not array.flags.c_contiguous and not array.flags.f_contiguous:
-            raise Refused(
-                f"{self.what} has an array that is a view of another, with gaps or reversed, which would be laid out "
-                "otherwise. Make it a whole one in the notebook: np.ascontiguousarray(...)."
-            )
-        order = "" if array.flags.c_contiguous else ', order="F"'
-        return f'{self.gathered.module_name("numpy", self.what)}.array({listed}, dtype="{array.dtype}"{order})'
+    def _stored_array(self, array: Any) -> str:
+        """Store an array of numbers as a file; return the call that reads it."""
+        gathered, arrays = self.gathered, self.gathered.arrays
+        name = next((name for name, other in arrays.items() if other is array), "")
+        if not name:
+            if READER not in gathered.definitions:
+                gathered.reserve(READER)
+                modules = {name: gathered.module_name(name, self.what) for name in ("numpy", "pathlib")}
+                gathered.definitions[READER] = _TEXT.format(reader=READER, folder=ARRAYS, **modules)
+                gathered.reads[READER] = frozenset()
+            name = identifier_of(self.wanted or "array", arrays.__contains__)
+            arrays[name] = array
+        return f'{READER}("{name}")'
 
 
-def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
+def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
     """Return what makes a simple object again, and with which arguments; None for any other."""
     kind = type(value)
     if kind is float:  # NaN and the infinities, which have no literal
         return float, (repr(value),)
     if kind is frozenset:
-        return (frozenset, (set(value),)) if value else (frozenset, ())
-    if kind is range:
-        every = (value.start, value.stop, value.step)
-        return range, every if value.step != 1 else every[not value.start : 2]
-    if kind is slice:
-        return slice, (value.start, value.stop) if value.step is None else (value.start, value.stop, value.step)
+        return frozenset, (set(value),) if value else ()
+    if kind is range and value.step == 1:
+        return range, (value.start, value.stop)
     if kind is re.Pattern:  # the flag for text is what re.compile adds by itself
-        flags = re.RegexFlag(value.flags) & ~(re.UNICODE if isinstance(value.pattern, str) else re.NOFLAG)
+        flags = re.RegexFlag(value.flags & ~re.UNICODE)
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
         return pathlib.Path, (str(value),)
     if kind in _KNOW_THEIR_CALL:
         made_by, arguments = value.__reduce__()[:2]
         return made_by, arguments
-    numpy = sys.modules.get("numpy")
-    if numpy is None or kind.__module__.partition(".")[0] != "numpy":
-        return None, ()
-    if isinstance(value, numpy.dtype):
-        return numpy.dtype, (value.str if value.names is None else "",)
-    # Python's own numbers hold these to the last bit.
-    is_number = isinstance(value, numpy.number | numpy.bool_)
-    if is_number and value.dtype.kind in "biuf" and value.dtype.itemsize <= 8:
-        return kind, (value.item(),)
-    return None, ()
+    if kind.__module__.partition(".")[0] == "numpy":
+        import numpy as np
+
+        if isinstance(value, np.dtype):
+            return np.dtype, (value.str,)
+        if isinstance(value, np.number | np.bool_):
+            return kind, (value.item(),)
+    return None
 
 
 # -- arrays in files ---------------------------------------------------------------------------------------------------
 
 ARRAYS: Final = "arrays"
 READER: Final = "stored_array"
-MOST_BYTES: Final = 16_000_000
-_ARRAY: Final = re.compile(rf'\b{READER}\("\w+"\)|array\([^"]*, dtype="\S+?"')
 _TEXT: Final = '''def {reader}(name):
     """Return an array that this bundle keeps as a file; it can't be written to."""
     array = {numpy}.load({pathlib}.Path(__file__).with_name("{folder}") / f"{{name}}.npy", allow_pickle=False)
@@ -357,59 +340,25 @@ _TEXT: Final = '''def {reader}(name):
     return array'''
 
 
-def array_reader(gathered: Slice) -> str:
-    """Return the function that reads the arrays that a module has from files; "" if there are none."""
-    if not gathered.arrays:
-        return ""
-    numpy, pathlib = (gathered.module_name(module, READER) for module in ("numpy", "pathlib"))
-    return _TEXT.format(reader=READER, numpy=numpy, pathlib=pathlib, folder=ARRAYS)
-
-
-def _stored(gathered: Slice, array: Any, what: str, wanted: str) -> str:
-    """Store an array of numbers as a file; return the call that reads it."""
-    known = next((name for name, other in gathered.arrays.items() if other is array), "")
-    if known:
-        return f'{READER}("{known}")'
-    size = sum(other.nbytes for other in gathered.arrays.values()) + array.nbytes
-    if size > MOST_BYTES:
-        raise Refused(
-            f"{what} uses an array, with which the bundle's arrays have {size / 1e6:.1f} MB; {MOST_BYTES / 1e6:g} "
-            "MB are the most. Pass it in as a token, or put it into the data of a package that is installed and "
-            "read it with importlib.resources."
-        )
-    if not gathered.arrays:
-        gathered.reserve(READER)
-    name = identifier_of(wanted or "array", gathered.arrays.__contains__)
-    gathered.arrays[name] = array
-    # What the function that reads them needs is known before the imports are written.
-    for module in ("numpy", "pathlib"):
-        gathered.module_name(module, what)
-    return f'{READER}("{name}")'
-
-
 def write_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays into a bundle, each in the order of its elements, to the last bit."""
-    if not arrays:
-        return
-    import numpy as np
+    """Write arrays into a bundle, each into the file of this name, in the order of its elements, to the last bit."""
+    for file, array in arrays.items():
+        import numpy as np
 
-    for name, array in arrays.items():
-        (folder / ARRAYS).mkdir(exist_ok=True)
-        np.save(folder / ARRAYS / f"{name}.npy", array, allow_pickle=False)
+        (folder / file).parent.mkdir(exist_ok=True)
+        np.save(folder / file, array, allow_pickle=False)
 
 
 # -- line breaks -------------------------------------------------------------------------------------------------------
 
-# What is too long for a line gets one item of its outermost brackets per line. Each item is followed by a comma, so
-# that formatters leave it on a line of its own. The arguments of a call stand on one line if they fit.
 LINE: Final = 88
 
-# What stands before an item, such as "name=", and the expression itself.
-Item = tuple[str, str]
 
-
-def laid_out(source: str, depth: int = 0, before: str = "", after: str = "") -> list[str]:
+def laid_out(source: str, depth: int = 0, before: str = "", after: str = "", *, is_broken: bool = False) -> list[str]:
     """Return the lines of an expression.
+
+    What is too long for a line gets one item of its outermost brackets per line. Each item is followed by a comma, so
+    that formatters leave it on a line of its own.
 
     Parameters
     ----------
@@ -419,46 +368,33 @@ def laid_out(source: str, depth: int = 0, before: str = "", after: str = "") -> 
         How many levels it is indented.
     before, after
         What stands before and after it: ``"x = "``, ``","``.
+    is_broken
+        Whether each item of its brackets gets a line of its own though the whole would fit.
     """
-    whole = f"{'    ' * depth}{before}{source}{after}"
-    opening, items, closing = ("", [], "") if len(whole) <= LINE else _brackets(source)
+    pad = "    " * depth
+    whole = f"{pad}{before}{source}{after}"
+    items = _items(ast.parse(source, mode="eval").body) if is_broken or len(whole) > LINE else []
     if not items:
         return [whole]
-    together = f"{'    ' * (depth + 1)}{', '.join(name + value for name, value in items)}"
-    if len(together) <= LINE and len(opening) > 1:  # the arguments of a call or subscript
-        pad = "    " * depth
-        return [pad + before + opening, together, pad + closing + after]
-    return one_per_line(before + opening, items, closing + after, depth)
-
-
-def one_per_line(opening: str, items: Iterable[Item], closing: str, depth: int = 0) -> list[str]:
-    """Return the lines of something in brackets, with a line for each item."""
-    pad = "    " * depth
-    lines = [line for before, source in items for line in laid_out(source, depth + 1, before, ",")]
-    return [pad + opening, *lines, pad + closing] if lines else [pad + opening + closing]
-
-
-def _brackets(source: str) -> tuple[str, list[Item], str]:
-    """Return the outermost brackets of an expression with what is in them; no items if it has none."""
     text = source.encode()  # the columns of syntax trees count bytes
+    lines = [pad + before + text[: items[0][0]].decode()]
+    for start, value in items:
+        name, item = text[start : value.col_offset].decode(), text[value.col_offset : value.end_col_offset].decode()
+        lines += laid_out(item, depth + 1, name, ",")
+    closing = text[items[-1][1].end_col_offset :].decode().lstrip(", ")
+    return [*lines, pad + closing + after]
 
-    def segment(node: ast.expr) -> str:
-        return text[node.col_offset : node.end_col_offset].decode()
 
-    match ast.parse(source, mode="eval").body:
-        case ast.Tuple(elts=items) if source.startswith("("):
-            return "(", [("", segment(item)) for item in items], ")"
-        case ast.List(elts=items):
-            return "[", [("", segment(item)) for item in items], "]"
-        case ast.Set(elts=items):
-            return "{", [("", segment(item)) for item in items], "}"
-        case ast.Dict(keys=keys, values=values) if None not in keys:
+def _items(node: ast.expr) -> list[tuple[int, ast.expr]]:
+    """Return what is in the outermost brackets of an expression: where each item begins, its name or key, its value."""
+    match node:
+        case ast.Tuple(elts=values) | ast.List(elts=values) | ast.Set(elts=values):
+            return [(value.col_offset, value) for value in values]
+        case ast.Subscript(slice=ast.Tuple(elts=values)):
+            return [(value.col_offset, value) for value in values]
+        case ast.Dict(keys=keys, values=values):
             pairs = zip(keys, values, strict=True)
-            return "{", [(f"{segment(key)}: ", segment(value)) for key, value in pairs if key], "}"
-        case ast.Subscript(value=kind, slice=ast.Tuple(elts=items)):
-            return f"{segment(kind)}[", [("", segment(item)) for item in items], "]"
-        case ast.Call(func=function, args=arguments, keywords=named):
-            given = [("", segment(value)) for value in arguments]
-            given += [(f"{word.arg}=" if word.arg else "**", segment(word.value)) for word in named]
-            return f"{segment(function)}(", given, ")"
-    return "", [], ""
+            return [(key.col_offset if key else value.col_offset - len("**"), value) for key, value in pairs]
+        case ast.Call(args=values, keywords=named):
+            return [(each.col_offset, each) for each in values] + [(each.col_offset, each.value) for each in named]
+    return []

@@ -1,4 +1,7 @@
-"""The text of a module: imports, constants, definitions in the notebook's order; and that of ``pipeline.py``."""
+"""The text of a module: imports, constants, definitions in the notebook's order; and that of ``pipeline.py``.
+
+What is emitted is simple. Whether it makes what the notebook has is found out by the comparison of their objects.
+"""
 
 from __future__ import annotations
 
@@ -7,28 +10,30 @@ import enum
 import functools
 import itertools
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
 
+from epypes.bundle.clone import arguments_of, parameters_of
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import LINE, array_reader, escaped, expression, laid_out, names_in, one_per_line, quoted
-from epypes.bundle.graphs import Graphs, GraphText, arguments_of, parameters_of
+from epypes.bundle.expressions import ARRAYS, LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.notebook_source import Position, parsed
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import run_call
-from epypes.graph import CompGraph
-from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
+from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
+from epypes.pipeline import FullPipeline, Node, Pipeline, SinkPipeline, SourcePipeline
+from epypes.run.guard import as_written
 
-if TYPE_CHECKING:
-    from epypes.bundle.promote import Subject
-
+PIPELINES: Final = (Pipeline, SourcePipeline, SinkPipeline, FullPipeline)
 # What the function that makes a pipeline is given, and hands on to the class.
 _GIVEN: Final = ("cg", "q_in", "q_out", "f_in", "f_out", "hparams")
-PIPELINES: Final = (Pipeline, SourcePipeline, SinkPipeline, FullPipeline)
+_NOT_MADE_AGAIN: Final = (
+    "is made with a {kind} that no expression makes again. Make it in __init__, from numbers, strings, a small array "
+    "or tuples of them."
+)
+_PORTS: Final = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
 # The folder is wherever the bundle is: it may be moved.
 _TEXT: Final = '''"""{title}
 
@@ -42,75 +47,77 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 """'''
 
 
-def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against."""
+# -- pipeline.py -------------------------------------------------------------------------------------------------------
 
-    def write(gathered: Slice) -> tuple[GraphText, Graphs, dict[str, list[str]], list[list[str]]]:
-        graphs = Graphs(gathered)
-        text = graphs.write(subject.cg)
-        own = dict(_own_lines(gathered, graphs, subject))
-        if settings.has_groups:
+
+def write_module(
+    cg: CompGraph, settings: Settings, ports: Mapping[str, Callable[..., Any]], pipeline: Pipeline | None
+) -> tuple[str, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the arrays that it reads by file, and the reasons against it.
+
+    Parameters
+    ----------
+    cg
+        The graph with the user's own functions.
+    settings
+        The bundle's settings.
+    ports
+        f_in and f_out, as far as they are not the usual ones of a bundle.
+    pipeline
+        The pipeline that is promoted, if it is of a class of the user's.
+    """
+    values = [*settings.hyperparameters.values(), *settings.defaults.values(), *settings.attributes.values()]
+    members = [member for value in values for member in members_in(value)]
+    enums = {type(member).__qualname__: type(member) for member in members if isinstance(member, enum.Enum)}
+    own = {MAKER: pipeline is not None, "enums": bool(enums), "func_groups": settings.has_groups}
+
+    def write(gathered: Slice) -> dict[str, str]:
+        graphs, definitions = Graphs(gathered), gathered.definitions
+        references = graphs.write(cg)
+        for name, port in ports.items():
+            reference = graphs.value(port, f"Function {name!r}", name)
+            if reference != name:
+                with gathered.noted_refusals():
+                    gathered.reserve(name)
+                definitions[name] = f"{_PORTS[name]}\n{name} = {reference}"
+        if pipeline is not None:
             with gathered.noted_refusals():
-                gathered.reserve("func_groups")
-        return text, graphs, own, _enums(gathered, settings)
+                definitions[MAKER] = graphs.maker(pipeline)
+        kinds = {name: graphs.value(kind, f"Class {name!r} of a hyperparameter", name) for name, kind in enums.items()}
+        if kinds:
+            definitions["enums"] = f"# Whose members stand in pipeline.toml.\n{_dict('enums', kinds)}"
+        return references
 
-    gathered, (text, graphs, own, enums) = gather(write, stores_arrays=True)
-    settings = replace(settings, own=tuple(own))
+    reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
+    gathered, references = gather(write, reserved, stores_arrays=True)
     if gathered.refusals:
-        return "", settings, {}, list(dict.fromkeys(gathered.refusals))
-    arrays = gathered.arrays
-    module = emit_module(settings, subject.cg, gathered, text, graphs.blocks, [*filter(None, own.values()), *enums])
-    why = refusal(module, arrays, functools.partial(_pairs, subject, settings))
-    return module, settings, arrays, [why] if why else []
+        return "", {}, list(dict.fromkeys(gathered.refusals))
+    arrays = {f"{ARRAYS}/{name}.npy": array for name, array in gathered.arrays.items()}
+    module = emit_module(settings, cg, gathered, references)
+    why = refusal(module, arrays, functools.partial(_pairs, cg, ports, pipeline, enums))
+    return module, arrays, [why] if why else []
 
 
-def _pairs(subject: Subject, settings: Settings, module: Any) -> Iterator[Pair]:
+def _pairs(
+    cg: CompGraph, ports: Mapping[str, Any], pipeline: Pipeline | None, enums: Mapping[str, type], module: Any
+) -> Iterator[Pair]:
     """Give what of the notebook is compared with the module, by how a reason calls it."""
-    for name, function in subject.cg.functions.items():
+    for name, function in cg.functions.items():
         yield f"Function {name!r}", function, module.func_dict[name]
-    for name, function in subject.ports.items():
-        yield f"Function {name!r}", function, getattr(module, name)
-    for what, kind in subject.classes.items():
-        yield what, kind, getattr(module, kind.__name__)
-    for enumeration in _enums_in(settings):
-        yield f"Class {enumeration.__name__!r}", enumeration, module.enums[enumeration.__qualname__]
-    pipeline = subject.pipeline
-    if MAKER in settings.own and isinstance(pipeline, FullPipeline):
-        given = (pipeline.q_in, pipeline.q_out, *(getattr(pipeline, name, None) for name in ("f_in", "f_out")))
+    for name, port in ports.items():
+        yield f"Function {name!r}", port, getattr(module, name)
+    for name, kind in enums.items():
+        yield f"Class {name!r}", kind, module.enums[name]
+    if pipeline is not None:
+        given = [getattr(pipeline, name, None) for name in _GIVEN[1:5]]
         made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
-        yield f"Pipeline {pipeline.name!r}", pipeline, made
+        if isinstance(pipeline, FullPipeline):
+            yield f"Pipeline {pipeline.name!r}", pipeline, made
+        else:
+            yield f"Class of pipeline {pipeline.name!r}", type(pipeline), type(made).__bases__[1]
 
 
-def _enums(gathered: Slice, settings: Settings) -> list[list[str]]:
-    """Return the lines that name the enumerations whose members stand in pipeline.toml."""
-    found: dict[str, str] = {}
-    for kind in _enums_in(settings):
-        with gathered.noted_refusals():
-            reference = gathered.add_class(kind, f"Class {kind.__name__!r} of a hyperparameter")
-            if found.setdefault(kind.__qualname__, reference) != reference:
-                raise Refused(f"Two hyperparameters are of two classes called {kind.__name__!r}. Rename one.")
-    if not found:
-        return []
-    with gathered.noted_refusals():
-        gathered.reserve("enums")
-    items = [(f"{quoted(name)}: ", reference) for name, reference in found.items()]
-    return [["# Whose members stand in pipeline.toml.", *one_per_line("enums = {", items, "}")]]
-
-
-def _enums_in(settings: Settings) -> dict[type[enum.Enum], None]:
-    values = [settings.hyperparameters, settings.defaults, settings.attributes]
-    members = [member for part in values for value in part.values() for member in members_in(value)]
-    return dict.fromkeys(type(member) for member in members if isinstance(member, enum.Enum))
-
-
-def emit_module(
-    settings: Settings,
-    cg: CompGraph,
-    needed: Slice,
-    written: Mapping[str, str] | GraphText,
-    blocks: Sequence[Sequence[str]] = (),
-    own: Sequence[Sequence[str]] = (),
-) -> str:
+def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Mapping[str, str]) -> str:
     """Return the text of ``pipeline.py``.
 
     Parameters
@@ -120,189 +127,160 @@ def emit_module(
     cg
         The graph.
     needed
-        What its functions need.
-    written
-        How its functions are written, or by function the expression that refers to it.
-    blocks
-        Lines that stand before the graph: switches, nodes and pipelines that are functions of it.
-    own
-        Lines that stand behind it: what the bundle has of its own in place of the usual ports and pipeline.
+        What its functions need, and what the bundle has of its own.
+    references
+        By function the expression that refers to it.
     """
-    text = written if isinstance(written, GraphText) else GraphText(written)
-    tail = [*blocks, text.functions("func_dict"), text.io("func_io", cg)]
-    if cg.groups:
-        items = [(f"{quoted(name)}: ", f"[{', '.join(map(quoted, part))}]") for name, part in cg.groups.items()]
-        tail.append(["# Drawn as one box each.", *one_per_line("func_groups = {", items, "}")])
-    return module_text([_docstring(settings)], needed, [_spaced(["\n".join(block) for block in [*tail, *own]])])
-
-
-def _spaced(blocks: Sequence[str]) -> str:
-    """Join blocks by one empty line; by two where one of them defines something."""
-    text = blocks[0]
-    for before, block in itertools.pairwise(blocks):
-        defines = any(line.startswith(("def ", "class ")) for line in f"{before}\n{block}".splitlines())
-        text += ("\n\n\n" if defines else "\n\n") + block
-    return text
-
-
-def _docstring(settings: Settings) -> str:
-    """Return the module's docstring, which names the graph and how to run it."""
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
-    title = escaped(f"The computational graph {settings.name}: {ends}.")
-    if len(title) > LINE - 3:
-        title = escaped(f"The computational graph {settings.name}.")
+    titles = [escaped(f"The computational graph {settings.name}{more}.") for more in (f": {ends}", "")]
+    title = titles[len(titles[0]) > LINE - len('"""')]
     run = f"    runner.{run_call(settings.inputs)}"
     if not all(token.isidentifier() for token in settings.inputs) or len(run) > LINE:
         run = "    runner.run(**payload)"
-    return _TEXT.format(title=title, run=escaped(run))
+    head = _TEXT.format(title=title, run=run)
+    blocks = [_dict("func_dict", references), _io("func_io", cg)]
+    if cg.groups:
+        groups = {name: bracketed([*part], quoted) for name, part in cg.groups.items()}
+        blocks.append(f"# Drawn as one box each.\n{_dict('func_groups', groups)}")
+    return module_text(needed, "\n\n".join(blocks), head)
 
 
-# -- what a bundle has of its own -------------------------------------------------------------------------------------
+def _dict(variable: str, items: Mapping[str, str]) -> str:
+    """Return the lines of a dict that has a variable."""
+    inner = ", ".join(f"{quoted(name)}: {source}" for name, source in items.items())
+    return "\n".join(laid_out(f"{{{inner}}}", before=f"{variable} = ", is_broken=True))
 
 
-def _own_lines(gathered: Slice, graphs: Graphs, subject: Subject) -> Iterator[tuple[str, list[str]]]:
-    """Give what the module has of its own in place of what a bundle usually does, by name; refusals are gathered."""
-    comments = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
-    for name, function in subject.ports.items():
-        reference = graphs.value(function, f"Function {name!r}", name)
-        if reference == name:
-            yield name, []
-            continue
-        with gathered.noted_refusals():
-            gathered.reserve(name)
-        yield name, [comments[name], f"{name} = {reference}"]
-    if subject.pipeline is not None and type(subject.pipeline) not in PIPELINES:
-        with gathered.noted_refusals():
-            gathered.reserve(MAKER)
-            yield MAKER, _maker(gathered, subject.pipeline)
+def _io(variable: str, cg: CompGraph) -> str:
+    """Return the lines of what each function of a graph takes and makes."""
+
+    def side(tokens: str | Iterable[str] | None) -> str:
+        if tokens is None or isinstance(tokens, str):
+            return "None" if tokens is None else quoted(tokens)
+        return bracketed(tuple(tokens), quoted)
+
+    return _dict(variable, {name: bracketed(tuple(sides), side) for name, sides in cg.func_io.items()})
 
 
-def _maker(gathered: Slice, pipeline: Pipeline) -> list[str]:
-    """Return the function that makes the pipeline of a user's class."""
-    kind, what = type(pipeline), f"Pipeline {pipeline.name!r}"
-    known = gathered.add_class(kind, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}")
-    lines: list[str] = []
-    if not isinstance(pipeline, FullPipeline):
-        known, lines = _answering(gathered, kind, known, what)
-        arguments = [quoted(pipeline.name), *_GIVEN]
-    else:
-        arguments = _arguments(gathered, pipeline, what)
-    made = f"{known}({', '.join(arguments)})"
-    head = f"def {MAKER}({', '.join(_GIVEN)}):"
-    return [*lines, head, '    """Return the pipeline that answers events."""', *laid_out(made, 1, "return ")]
+class Graphs:
+    """Writes a graph; its nodes, switches and the graphs of its pipelines become definitions of the module.
+
+    Parameters
+    ----------
+    gathered
+        The module that it is for; is added to.
+    """
+
+    def __init__(self, gathered: Slice) -> None:
+        self.gathered = gathered
+        self._made: dict[int, str] = {}
+
+    def write(self, cg: CompGraph, where: str = "") -> dict[str, str]:
+        """Write a graph, or that of a pipeline, with where it is; return by function the expression that refers to it.
+
+        Refusals are gathered.
+        """
+        references: dict[str, str] = {}
+        for name, function in cg.functions.items():
+            what, switch = f"Function {name!r}{where}", as_switch(function)
+            if is_placeholder(function):
+                way_out = f"Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
+                self.gathered.refusals.append(f"{what} is a placeholder. {way_out}")
+            elif switch is not None:
+                with self.gathered.noted_refusals():
+                    references[name] = self._switch(cg, name, switch, what)
+            else:
+                references[name] = self.value(function, what, name)
+        return references
+
+    def value(self, value: Any, what: str, name: str) -> str:
+        """Return the expression of a function, or of an argument that makes one."""
+        while type(value) is Node:  # it does nothing else than call its function
+            value = as_written(value.func)
+        if not isinstance(value, Node):
+            return expression_or_none(self.gathered, value, what, _NOT_MADE_AGAIN, name)
+        if id(value) not in self._made:
+            self._made[id(value)] = "None"
+            with self.gathered.noted_refusals():
+                known = self.gathered.add_class(type(value), _class_of(value, what))
+                made = f"{known}({', '.join(self._arguments(value, what, name))})"
+                self._made[id(value)] = self._variable(name, made)
+        return self._made[id(value)]
+
+    def _variable(self, name: str, source: str, comment: str = "") -> str:
+        variable = self.gathered.free_name(name)
+        self.gathered.definitions[variable] = comment + "\n".join(laid_out(source, before=f"{variable} = "))
+        return variable
+
+    def _switch(self, cg: CompGraph, name: str, switch: Switch, what: str) -> str:
+        by, *tokens = cg.func_inputs(name)
+        keys = [self.value(key, what, name) for key in switch.branches]
+        branches = ", ".join(f"{key}: {quoted(token)}" for key, token in zip(keys, tokens, strict=True))
+        output = quoted(cg.func_outputs(name)[0])
+        epypes = self.gathered.module_name("epypes", what)
+        made = f"{epypes}.switch({quoted(name)}, {{{branches}}}, by={quoted(by)}, output={output})"
+        variable = self._variable(name, made, f"# Only the branch that {escaped(by, 80)} chooses is computed.\n")
+        return f"{variable}.functions[{quoted(name)}]"
+
+    def _arguments(self, made: Node, what: str, name: str, besides: Sequence[str] = ()) -> list[str]:
+        """Return the arguments that make a node or pipeline again, but for some."""
+        given = {parameter: value for parameter, value in arguments_of(made, what).items() if parameter not in besides}
+        return [
+            f"{parameter}={self._inner_graph(value, what, name)}"
+            if isinstance(value, CompGraph)
+            else f"{parameter}={self.value(value, what, f'{name}_{parameter}')}"
+            for parameter, value in given.items()
+        ]
+
+    def _inner_graph(self, cg: CompGraph, what: str, name: str) -> str:
+        """Write the graph of a pipeline; return its expression."""
+        references = self.write(cg, f" of {what[0].lower()}{what[1:]}")
+        variables = self.gathered.free_name(f"{name}_functions"), self.gathered.free_name(f"{name}_io")
+        ends = f"{', '.join(cg.source_tokens) or 'nothing'} -> {', '.join(cg.sink_tokens) or 'nothing'}"
+        comment = f"# {escaped(f'A graph of its own: {ends}.', 80)}"
+        self.gathered.definitions[variables[0]] = f"{comment}\n{_dict(variables[0], references)}"
+        self.gathered.definitions[variables[1]] = _io(variables[1], cg)
+        epypes = self.gathered.module_name("epypes", what)
+        source = f"{epypes}.CompGraph({', '.join(variables)}{'' if cg.types else ', types=False'})"
+        for group, members in cg.groups.items():
+            source = f"{epypes}.group({source}, {quoted(group)}, functions={bracketed([*members], quoted)})"
+        return source
+
+    def maker(self, pipeline: Pipeline) -> str:
+        """Return the function that makes the pipeline of a user's class; of one that takes no events, one that does.
+
+        Raises
+        ------
+        Refused
+            A service can't make it, or can't give it events.
+        """
+        kind, what = type(pipeline), f"Pipeline {pipeline.name!r}"
+        known = self.gathered.add_class(kind, _class_of(pipeline, what))
+        taken = [parameter.name for parameter in parameters_of(kind)]
+        of_user = {name for above in kind.__mro__ if above not in FullPipeline.__mro__ for name in vars(above)}
+        if not isinstance(pipeline, FullPipeline | SourcePipeline) and not of_user & {"__init__", "emit"}:
+            full = f"{self.gathered.module_name('epypes', what)}.FullPipeline"
+            known, taken = f'type("Answering{kind.__name__}", ({full}, {known}), {{}})', [*_GIVEN]
+        missing = [name for name in ("cg", "q_in", "q_out", "hparams") if name not in taken]
+        if missing:
+            text = f"{what} is of class {kind.__name__!r}, to which a service can't give {', '.join(missing)}"
+            way_out = "Make it a subclass of ep.FullPipeline, whose __init__ takes them, and hands them on"
+            raise Refused(f"{text}. {way_out}: super().__init__(..., {missing[0]}={missing[0]}).")
+        arguments = self._arguments(pipeline, what, pipeline.name, _GIVEN)
+        arguments += [f"{name}={name}" for name in _GIVEN if name in taken]
+        head = [f"def {MAKER}({', '.join(_GIVEN)}):", '    """Return the pipeline that answers events."""']
+        made = laid_out(f"{known}({', '.join(arguments)})", 1, "return ")
+        return "\n".join([*head, *made])
 
 
-def _arguments(gathered: Slice, pipeline: Pipeline, what: str) -> list[str]:
-    taken = [parameter.name for parameter in parameters_of(type(pipeline))]
-    for name in ("cg", "q_in", "q_out", "hparams"):
-        if name not in taken:
-            text = f"{what} is of class {type(pipeline).__name__!r}, whose __init__ does not take {name!r}"
-            raise Refused(f"{text}. Take it, and hand it on: super().__init__(..., {name}={name}).")
-    arguments: list[str] = []
-    given = arguments_of(pipeline, what)
-    for name in taken:
-        if name in _GIVEN:
-            arguments.append(f"{name}={name}")
-        elif name in given:
-            source = expression(gathered, given[name], what)
-            if not source:
-                text = f"{what} is made with {name!r}, a {type(given[name]).__name__} that no expression makes again"
-                raise Refused(f"{text}. Make it in __init__, from numbers, strings or tuples of them.")
-            arguments.append(f"{name}={source}")
-    return arguments
-
-
-def _answering(gathered: Slice, kind: type[Pipeline], known: str, what: str) -> tuple[str, list[str]]:
-    """Return the name of a class that does what a user's pipeline does and answers events, and its definition."""
-    way_out = "Make it a subclass of ep.FullPipeline."
-    if issubclass(kind, SourcePipeline):
-        raise Refused(f"{what} is of class {kind.__name__!r}, a SourcePipeline, which takes no events. {way_out}")
-    usual = SinkPipeline if issubclass(kind, SinkPipeline) else Pipeline
-    if getattr(kind, "emit", None) is not getattr(usual, "emit", None):
-        raise Refused(f"{what} is of class {kind.__name__!r}, whose emit() a service would not call. {way_out}")
-    if [parameter.name for parameter in parameters_of(kind)] != [parameter.name for parameter in parameters_of(usual)]:
-        text = f"{what} is of class {kind.__name__!r}, whose __init__ takes what a service can't give."
-        raise Refused(f"{text} {way_out}")
-    name = f"Answering{kind.__name__}"
-    gathered.reserve(name)
-    full = f"{gathered.module_name('epypes', what)}.FullPipeline"
-    return name, [
-        f"class {name}({full}, {known}):",
-        f'    """{kind.__name__}, driven by events."""',
-        "",
-        "",
-    ]
+def _class_of(made: Node, what: str) -> str:
+    return f"Class {type(made).__name__!r} of {what[0].lower()}{what[1:]}"
 
 
 # -- the layout of a module -------------------------------------------------------------------------------------------
 
 
-def ordered(
-    texts: Mapping[str, str],
-    positions: Mapping[str, Position],
-    reads: Mapping[str, frozenset[str]],
-    closures: Collection[str],
-) -> list[str]:
-    """Return the names of definitions in the order in which they stand in a module.
-
-    Parameters
-    ----------
-    texts
-        The definitions by name, in an order in which they could stand but for those that need each other.
-    positions
-        Where they stand in the notebook, as far as that is known; others stand before what needs them, or at the end.
-    reads
-        The names that definitions read from outside, as far as that is known; of others, all that they mention.
-    closures
-        The names of closures: what makes them calls nothing of what it is given.
-    """
-    trees = {name: parsed(text) or ast.Module([], []) for name, text in texts.items()}
-    mentioned = {name: reads[name] if name in reads else _names(ast.walk(tree)) for name, tree in trees.items()}
-    needs = {name: _needs(name, tree, mentioned, name in closures) for name, tree in trees.items()}
-    found: dict[str, None] = {}
-    begun: set[str] = set()
-    pending = sorted(texts, key=lambda name: (name not in positions, positions.get(name, ())))[::-1]
-    rank = {name: number for number, name in enumerate(pending)}
-    while pending:
-        if pending[-1] in begun:
-            found[pending.pop()] = None
-            continue
-        begun.add(pending[-1])
-        pending += sorted(needs[pending[-1]] - begun, key=rank.__getitem__)
-    return list(found)
-
-
-def _needs(name: str, tree: ast.Module, mentioned: Mapping[str, frozenset[str]], is_closure: bool) -> set[str]:
-    """Return the definitions that importing one reads; what it calls may read all that it mentions."""
-    read = [part for statement in tree.body for part in _read_at_import(statement)]
-    found = set(_names(iter(read)) & mentioned.keys())
-    if not is_closure and any(
-        isinstance(part, ast.Call | ast.ClassDef) or getattr(part, "decorator_list", []) for part in read
-    ):
-        pending = list(found)
-        while pending:
-            more = (mentioned[pending.pop()] & mentioned.keys()) - found
-            found |= more
-            pending += more
-    return found - {name}
-
-
-def _names(parts: Iterator[ast.AST]) -> frozenset[str]:
-    return frozenset(part.id for part in parts if isinstance(part, ast.Name))
-
-
-def _read_at_import(node: ast.AST) -> Iterator[ast.AST]:
-    """Give the parts of a statement that are executed at import, which the bodies of functions are not."""
-    yield node
-    for name, value in ast.iter_fields(node):
-        if name == "body" and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            continue
-        for part in value if isinstance(value, list) else [value]:
-            if isinstance(part, ast.AST):
-                yield from _read_at_import(part)
-
-
-def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
+def module_text(needed: Slice, tail: str, head: str = "") -> str:
     """Return the text of a module: what stands at its head, what its functions need, and what stands behind that."""
     texts = {name: text.rstrip() for name, text in needed.definitions.items()}
     positions = needed.positions | {name: one.position for name, one in needed.constants.items() if one.position}
@@ -311,24 +289,64 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
         if names_in(known.source) & needed.definitions.keys():
             texts[name] = "\n".join(known.lines)
         else:
-            early += [*[""][: bool(early) and known.lines[0].startswith("#")], *known.lines]
-    reader = array_reader(needed)
-    imports = [_import_lines(needed.imports.values())] if needed.imports else []
-    constants = ["\n".join(early)] if early else []
-    sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]
-    if reader:
-        sections += [reader, *constants]
-    names = ordered(texts, positions, needed.reads, needed.closures)
-    for are_constants, group in itertools.groupby(names, needed.constants.__contains__):
-        found = [texts[name] for name in group]
+            early += ["", *known.lines] if early and known.lines[0].startswith("#") else known.lines
+    sections = ["\n\n".join(filter(None, [head, _import_lines(needed.imports.values()), "\n".join(early)]))]
+    for are_constants, names in itertools.groupby(_ordered(texts, positions, needed), needed.constants.__contains__):
+        found = [texts[name] for name in names]
         sections += ["\n".join(found)] if are_constants else found
-    return "\n\n\n".join([*filter(None, sections), *tail]) + "\n"
+    return "\n\n\n".join(filter(None, [*sections, tail])) + "\n"
 
 
 def _import_lines(statements: Iterable[str]) -> str:
     """Return imports in order: Python's own first, whole modules before names from modules."""
-    in_order = sorted(dict.fromkeys(statements), key=lambda text: (text.startswith("from"), text.lower(), text))
-    first = [text for text in in_order if text.startswith("from __future__")]
-    others = [text for text in in_order if text.split()[1].partition(".")[0] not in sys.stdlib_module_names]
-    own = [text for text in in_order if text not in first and text not in others]
-    return "\n\n".join("\n".join(part) for part in (first, own, others) if part)
+
+    def section(text: str) -> int:
+        top = text.split()[1].partition(".")[0]
+        return 0 if top == "__future__" else 1 if top in sys.stdlib_module_names else 2
+
+    in_order = sorted(set(statements), key=lambda text: (section(text), text.startswith("from"), text.lower(), text))
+    return "\n\n".join("\n".join(part) for _, part in itertools.groupby(in_order, section))
+
+
+def _ordered(texts: Mapping[str, str], positions: Mapping[str, Position], needed: Slice) -> list[str]:
+    """Return the names of definitions in the order of the notebook, each behind what importing it reads.
+
+    What the notebook has nowhere stands before what needs it, or at the end.
+    """
+    mentioned = {name: needed.reads[name] if name in needed.reads else names_in(text) for name, text in texts.items()}
+    by_position = sorted(texts, key=lambda name: (name not in positions, positions.get(name, ())))
+    found: dict[str, None] = {}
+    begun: set[str] = set()
+
+    def place(name: str) -> None:
+        if name not in begun:
+            begun.add(name)
+            needs = _needs(texts[name], mentioned, name in needed.closures)
+            for other in by_position:
+                if other in needs:
+                    place(other)
+            found[name] = None
+
+    for name in by_position:
+        place(name)
+    return [*found]
+
+
+def _needs(text: str, mentioned: Mapping[str, Iterable[str]], is_closure: bool) -> set[str]:
+    """Return the definitions that importing one reads; what it calls may read all that it mentions.
+
+    What makes a closure calls nothing of what it is given.
+    """
+    tree = parsed(text) or ast.Module([], [])
+    for part in ast.walk(tree):
+        if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef):
+            part.body = []  # is not executed at import
+    parts = [*ast.walk(tree)]
+    found = {part.id for part in parts if isinstance(part, ast.Name) and part.id in mentioned}
+    calls = any(isinstance(part, ast.Call | ast.ClassDef) or getattr(part, "decorator_list", []) for part in parts)
+    pending = [*found] if calls and not is_closure else []
+    while pending:
+        more = (mentioned.keys() & mentioned[pending.pop()]) - found
+        found |= more
+        pending += more
+    return found

@@ -8,94 +8,26 @@ passed them all replaces an older one.
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
-from epypes.bundle.clone import clone_runner
+from epypes.bundle.clone import clone_runner, parameters_of
 from epypes.bundle.determinism import prove
 from epypes.bundle.draft import draft_folder, swap_folders
 from epypes.bundle.expressions import write_arrays
-from epypes.bundle.graphs import parameters_of
-from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
+from epypes.bundle.load import MAKER, MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import (
-    Settings,
-    store_arrays,
-    unwritable,
-    writable_defaults,
-    write_settings,
-    write_stored_arrays,
-)
+from epypes.bundle.settings import Settings, store_arrays, unwritable, writable_defaults, write_settings
 from epypes.errors import EpypesError, MessageError, PromotionRefused, run_call
-from epypes.graph import CompGraph, colour_order
+from epypes.graph import colour_order
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import as_written
-
-_NO_RUNNER: Final = (
-    "An object of class {} can't be promoted. Make a runner and run it: "
-    "runner = CompGraphRunner(cg, hparams); runner.run(...)."
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """What is promoted.
-
-    Attributes
-    ----------
-    runner, cg
-        Its runner, whose last run is recorded, and the graph with the user's own functions.
-    pipeline
-        The pipeline; None if a runner is promoted.
-    ports
-        f_in and f_out, as far as they are not the usual ones of a bundle.
-    attributes
-        Those of the pipeline.
-    """
-
-    runner: CompGraphRunner
-    cg: CompGraph
-    pipeline: Pipeline | None = None
-    ports: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def classes(self) -> Mapping[str, type]:
-        """The class of the pipeline by how reasons call it, if it is not one of EPypes."""
-        kind = type(self.pipeline)
-        if self.pipeline is None or kind in PIPELINES:
-            return {}
-        return {f"Class {kind.__name__!r} of pipeline {self.pipeline.name!r}": kind}
-
-
-def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:
-    """Return what is promoted.
-
-    Raises
-    ------
-    Refused
-        It is neither a runner nor a pipeline, or a port is no function.
-    """
-    ports = {"f_in": f_in, "f_out": f_out}
-    for name, port in ports.items():
-        if port is not None and not callable(port):
-            raise Refused(f"{name} must be a function, not {type(port).__name__!r}.")
-    if isinstance(given, Pipeline):  # its class may also make a port itself
-        taken = {parameter.name for parameter in parameters_of(type(given))}
-        ports |= {name: getattr(given, name, None) for name in ports if ports[name] is None and name in taken}
-    elif not isinstance(given, CompGraphRunner):
-        raise Refused(_NO_RUNNER.format(type(given).__name__))
-    own = {name: as_written(port) for name, port in ports.items() if port is not None and not is_usual(port)}
-    if isinstance(given, Pipeline):
-        return Subject(given.runner, given.source_cg, given, own, dict(given.attributes))
-    return Subject(given, given.cg, None, own)
 
 
 def _ignore(text: str) -> None:
@@ -138,23 +70,19 @@ def promote(
         process that computes something else.
     """
     # A link that names the current version goes on naming it; what it points to is replaced.
+    target = Path(os.path.realpath(to))
     try:
-        target = Path(to).resolve()
-    except (OSError, RuntimeError) as error:
-        raise PromotionRefused(to, [f"{to} is no place to write to: {error}. Name another folder."]) from error
-    try:
-        subject = subject_of(runner_or_pipeline, f_in, f_out)
-    except Refused as refusal:
-        raise PromotionRefused(target, [str(refusal)]) from refusal
-    try:
+        ports = _ports(runner_or_pipeline, f_in, f_out)
         _check_place(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_folder(target) as draft:
-            _write(draft, target, subject, outputs, samples)
+            _write(draft, target, runner_or_pipeline, ports, outputs, samples)
             on_progress("replaying in a fresh process")
             for note in prove(draft, target).notes:
                 on_progress(note)
             _replace(draft, target)
+    except (Refused, MessageError) as refusal:
+        raise PromotionRefused(target, [str(refusal)]) from refusal
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):
             raise
@@ -162,74 +90,82 @@ def promote(
     return read_bundle(target)
 
 
+def _ports(given: object, f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]]:
+    """Return f_in and f_out as the user wrote them, as far as they are not the usual ones of a bundle."""
+    ports = {"f_in": f_in, "f_out": f_out}
+    for name, port in ports.items():
+        if port is not None and not callable(port):
+            raise Refused(f"{name} must be a function, not {type(port).__name__!r}.")
+    if isinstance(given, Pipeline):  # its class may also make a port itself
+        taken = {parameter.name for parameter in parameters_of(type(given))}
+        ports |= {name: getattr(given, name, None) for name in ports if ports[name] is None and name in taken}
+    elif not isinstance(given, CompGraphRunner):
+        way_out = "Make a runner and run it: runner = CompGraphRunner(cg, hparams); runner.run(...)."
+        raise Refused(f"An object of class {type(given).__name__} can't be promoted. {way_out}")
+    return {name: as_written(port) for name, port in ports.items() if port is not None and not is_usual(port)}
+
+
 def _check_place(target: Path) -> None:
-    """Refuse to write over what is not a bundle, or into one."""
-    why = _why_not_replaced(target)
-    if why:
-        raise PromotionRefused(target, [why])
+    """Refuse to write over what is neither a bundle nor an empty folder, or into a bundle."""
     around = next((parent for parent in target.parents if (parent / MANIFEST).is_file()), None)
     if around is not None:
-        raise PromotionRefused(
-            target, [f"{target} is inside the bundle {around}, whose files may not change. Name another folder."]
-        )
-
-
-def _why_not_replaced(target: Path) -> str:
-    """Return why what is at a place may not be replaced; "" if it is a bundle, an empty folder, or nothing."""
+        raise Refused(f"{target} is inside the bundle {around}, whose files may not change. Name another folder.")
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
-        return ""
+        return
     if not (target / MANIFEST).is_file():
-        return f"{target} exists and is not a bundle. Name another folder, or remove it."
+        raise Refused(f"{target} exists and is not a bundle. Name another folder, or remove it.")
     why = why_no_bundle(target)
-    return f"{why} Replacing it would delete what it holds: name another folder, or move that away." if why else ""
+    if why:
+        raise Refused(f"{why} Replacing it would delete what it holds: name another folder, or move that away.")
 
 
 def _write(
     draft: Path,
     target: Path,
-    subject: Subject,
+    given: CompGraphRunner | Pipeline,
+    ports: Mapping[str, Callable[..., Any]],
     outputs: Sequence[str] | None,
     samples: Iterable[Any],
 ) -> None:
     """Write all that can be written without running anything new; raise every reason against it at once."""
-    runner, cg = subject.runner, subject.cg
+    if isinstance(given, Pipeline):
+        runner, cg, attributes = given.runner, given.source_cg, dict(given.attributes)
+    else:
+        runner, cg, attributes = given, given.cg, {}
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
     hyperparameters, stored = store_arrays(runner.hyperparameters)
-    reasons = [*_unready(runner, wanted), *unwritable(hyperparameters)]
-    reasons += unwritable(subject.attributes, "Attribute")
     free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
+    pipeline = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None
     settings = Settings(
         target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
-        attributes=subject.attributes, has_groups=bool(cg.groups),
+        own=(*ports, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
     )  # fmt: skip
-    module, settings, arrays, refusals = write_module(subject, settings)
+    reasons = [*_unready(runner, wanted), *unwritable(hyperparameters), *unwritable(attributes, "Attribute")]
+    module, arrays, refusals = write_module(cg, settings, ports, pipeline)
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
-    runs = [*_runs(target, subject, samples)]
+    runs = [*_runs(runner, samples)]
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
-    write_arrays(draft, arrays)
-    write_stored_arrays(draft, stored)
+    write_arrays(draft, {**arrays, **stored})
     for number, run in enumerate(runs):
-        _record(draft, f"{number:03}.npz", target, subject, run, settings)
+        _record(draft / SAMPLES / f"{number:03}.npz", run, settings, ports.get("f_out"))
 
 
-def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Run]:
+def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:
     """Give the last run, then runs of further payloads."""
-    if subject.runner.last is not None:  # as _unready has made sure
-        yield subject.runner.last
-    free = subject.runner.free_source_tokens
+    if runner.last is not None:  # as _unready has made sure
+        yield runner.last
     for number, sample in enumerate(samples, 1):
-        payload = sample if isinstance(sample, Mapping) else dict(zip(free[:1], [sample], strict=False))
+        payload = sample if isinstance(sample, Mapping) else dict.fromkeys(runner.free_source_tokens[:1], sample)
         try:
-            run = clone_runner(subject.runner).run_on(payload)
+            run = clone_runner(runner).run_on(payload)
         except Exception as error:  # whatever a function raises on it
-            text = f"Sample {number} can't be run: {type(error).__name__}: {error}"
-            raise PromotionRefused(target, [text]) from error
+            raise Refused(f"Sample {number} can't be run: {type(error).__name__}: {error}") from error
         yield run
 
 
@@ -247,32 +183,23 @@ def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
     return []
 
 
-def _record(draft: Path, name: str, target: Path, subject: Subject, run: Run, settings: Settings) -> None:
+def _record(path: Path, run: Run, settings: Settings, f_out: Callable[..., Any] | None) -> None:
     """Record a run as a sample, with the answer that the user's own f_out makes of it."""
     from epypes.wire.samples import save_sample
 
-    save = partial(save_sample, draft / SAMPLES / name, rgb=settings.rgb)
-    try:
-        inputs, outputs = ({token: run[token] for token in side} for side in (settings.inputs, settings.outputs))
-        if "f_out" in subject.ports:
-            answer = answer_of(subject.ports["f_out"], settings.name, run, settings.attributes)
-            # An answer without a codec can't be sent either.
-            with contextlib.suppress(MessageError):
-                return save(inputs, outputs if answer is None else {**outputs, ANSWER: answer})
-        save(inputs, outputs)
-    except MessageError as error:
-        raise PromotionRefused(target, [str(error)]) from error
+    inputs, outputs = ({token: run[token] for token in side} for side in (settings.inputs, settings.outputs))
+    answer = answer_of(f_out, settings.name, run, settings.attributes) if f_out is not None else None
+    if answer is not None:
+        # An answer without a codec can't be sent either.
+        with contextlib.suppress(MessageError):
+            return save_sample(path, inputs, {**outputs, ANSWER: answer}, rgb=settings.rgb)
+    return save_sample(path, inputs, outputs, rgb=settings.rgb)
 
 
 def _replace(draft: Path, target: Path) -> None:
     """Put the new bundle in the place of the old one; at every moment one of the two is there."""
     _check_place(target)
-    if not target.exists():
+    if target.exists():
+        swap_folders(draft, target)  # the old one is then in the scratch folder, and goes with it
+    else:
         draft.rename(target)
-        return
-    # The old one is then in the scratch folder, and goes with it; unless it is no bundle any more.
-    swap_folders(draft, target)
-    why = _why_not_replaced(draft)
-    if why:
-        swap_folders(draft, target)
-        raise PromotionRefused(target, [why.replace(str(draft), str(target))])

@@ -3,45 +3,47 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import chain
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, takewhile
 from typing import Any, Final
 
 from epypes.bundle.clone import called_by, is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import (
     LINE,
-    Item,
+    bracketed,
     escaped,
     expression_or_none,
-    identifiers_of,
+    identifier_of,
     is_identifier,
     laid_out,
     literal_source,
-    one_per_line,
+    names_in,
 )
 from epypes.bundle.module import module_text
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
-from epypes.graph import CompGraph, as_switch
+from epypes.graph import CompGraph, Switch, as_switch
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
-# Python itself can't indent deeper than 100; half of that can't be read.
-_DEEPEST: Final = 20
+# A longer default of a parameter is a constant above the function.
+_LONGEST: Final = 60
 _NO_EXPRESSION: Final = "is of type {kind}, and no expression makes it again. Write a plain function (def)."
 _NO_VALUE: Final = (
     "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
     "numbers, strings, a small array or tuples of them."
 )
+_NO_KEY: Final = "by a key of type {kind}, which no expression makes again. Choose by strings or numbers."
+# The branches of switches in which a function stands, from outside in: each a switch and the token that is passed on.
+Region = tuple[tuple[str, str], ...]
 
 
 def to_source(
     cg: CompGraph | CompGraphRunner | Pipeline,
     hparams: Mapping[str, Any] | None = None,
     *,
-    returns: Sequence[str] | str | None = None,
+    returns: Iterable[str] | str | None = None,
     name: str = "run_graph",
 ) -> str:
     """Write a graph as a Python module with one straight-line function that computes the same.
@@ -99,83 +101,114 @@ def to_source(
         y = math.sqrt(x)
         return y
     """
-    if not isinstance(name, str):
-        raise TypeError(f'name is what the function is called, a string as "run_graph", not {type(name).__name__!r}.')
     graph, values = _subject(cg, hparams)
-    wanted = _wanted(graph, returns)
-    return _written(name, graph, values, wanted)
+    wanted = (returns,) if isinstance(returns, str) else None if returns is None else tuple(returns)
+    for token in wanted or ():
+        graph.require_token(token)
 
+    def write(gathered: Slice) -> _Module:
+        module = _Module(gathered)
+        if not is_identifier(name) or hasattr(builtins, name):
+            text = f"name={name!r} can't be a function's name. Give a word that means nothing to Python."
+            gathered.refusals.append(text)
+        _Function(module, name, graph, values, wanted)
+        return module
 
-def _written(name: str, cg: CompGraph, values: Mapping[str, Any], wanted: tuple[str, ...] | None) -> str:
-    def write(gathered: Slice) -> list[_Part]:
-        parts = _with_pipelines(_Part(name, cg, values, wanted))
-        missing = [function for part in parts for function in part.cg.placeholders if function in set(part.functions)]
-        if missing:
-            raise PlaceholderNeeded(missing)
-        gathered.refusals += _unwritable(parts, name, wanted)
-        _slice(gathered, parts)
-        for part in parts:
-            _write_values(gathered, part)
-        return parts
-
-    gathered, parts = gather(write, reserved=(name,))
-    if gathered.refusals:
-        raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
-    text = module_text([], gathered, [part.text() for part in parts])
-    why = _difference(text, parts)
-    if why:
-        raise SourceRefused((why,))
+    gathered, module = gather(write, reserved=(name,))
+    text = module_text(gathered, "\n\n\n".join(module.texts))
+    reasons = [*dict.fromkeys(gathered.refusals)] or [*filter(None, [module.difference(text)])]
+    if reasons:
+        raise SourceRefused(tuple(reasons))
     return text
 
 
-def _difference(text: str, parts: Sequence[_Part]) -> str:
-    """Return why what a module calls is not what the graph calls; "" if it is."""
-    compared: list[tuple[str, Any, str]] = []
-    for part in parts:
-        for name, source in part.references.items():
-            if name not in part.pipelines:
-                compared.append((f"Function {name!r}{part.where}", part.cg.functions[name], source))
-        for token, source in part.defaults.items():
-            compared.append((f"Hyperparameter {token!r}{part.where}", part.values[token], source))
-    whole = "\n".join([text, *one_per_line("references = [", [("", source) for _, _, source in compared], "]"), ""])
-
-    def pairs(module: Any) -> list[Pair]:
-        return [(what, ours, made) for (what, ours, _), made in zip(compared, module.references, strict=True)]
-
-    return refusal(whole, {}, pairs)
+def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, Mapping[str, Any]]:
+    """Return a graph and the values of its hyperparameters, which are checked."""
+    if isinstance(given, CompGraphRunner | Pipeline):
+        runner = given.runner if isinstance(given, Pipeline) else given
+        cg, known = given.cg, runner.hyperparameters
+    else:
+        cg, known = given, getattr(given, "defaults", {})
+    values = {**known, **(hparams or {})}
+    CompGraphRunner(cg, values)  # raises for what is no graph, and for what can't be a hyperparameter
+    return cg, values
 
 
-@dataclass(eq=False, slots=True)
-class _Region:
-    """A place of functions: the graph itself, or a branch of a switch.
+class _Module:
+    """The module that a graph becomes.
 
     Attributes
     ----------
-    around
-        The region in which the switch is; None for the graph.
-    token
-        The token that the branch passes on.
-    keys
-        The values of the selector that choose it.
-    functions
-        The functions that stand in it, in run order.
+    gathered
+        What its functions need.
+    texts
+        The functions: one for each pipeline in the graph, then its own.
+    pipelines
+        The names of the functions of pipelines, by id.
+    compared
+        What is compared with the notebook: how reasons call it, the value, its expression.
     """
 
-    around: _Region | None = None
-    depth: int = 0
-    token: str = ""
-    keys: list[Hashable] = field(default_factory=list)
-    functions: list[str] = field(default_factory=list)
+    def __init__(self, gathered: Slice) -> None:
+        self.gathered = gathered
+        self.texts: list[str] = []
+        self.pipelines: dict[int, str] = {}
+        self.compared: list[tuple[str, Any, str]] = []
+
+    def expression(self, what: str, value: Any, reason: str, wanted: str = "") -> str:
+        """Return the expression of a value that is compared; refusals are gathered."""
+        source = expression_or_none(self.gathered, value, what, reason, wanted)
+        self.compared.append((what, value, source))
+        return source
+
+    def difference(self, text: str) -> str:
+        """Return why what a module calls is not what the graph calls; "" if it is."""
+        sources = ", ".join(source for _, _, source in self.compared)
+
+        def pairs(module: Any) -> list[Pair]:
+            return [(what, ours, made) for (what, ours, _), made in zip(self.compared, module.references, strict=True)]
+
+        return refusal(f"{text}references = [{sources}]\n", {}, pairs)
 
 
-class _Part:
-    """A graph that becomes a function: the one that was given, or that of a pipeline in it.
+def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dict[str, Region], list[str]]:
+    """Return where each function that is needed stands, in run order, and the tokens that are made, read or returned.
+
+    It stands in the innermost branch around all that needs it.
+    """
+    used: dict[str, Region] = dict.fromkeys(returns, ())
+    found: dict[str, Region] = {}
+    switches = set(cg.switches)
+    for name in reversed(tuple(cg.functions)):
+        made = cg.func_outputs(name)
+        readers = [used[token] for token in made if token in used]
+        if not readers and (made or not is_whole):
+            continue
+        found[name] = region = _common(readers or [()])
+        for number, token in enumerate(cg.func_inputs(name)):
+            reader = (*region, (name, token)) if name in switches and number else region
+            used[token] = _common([used.get(token, reader), reader])
+    regions = {name: found[name] for name in cg.functions if name in found}
+    seen = {*used, *chain.from_iterable(map(cg.func_outputs, regions))}
+    return regions, [token for token in cg.tokens if token in seen]
+
+
+def _common(regions: Sequence[Region]) -> Region:
+    """Return the innermost region around all of these."""
+    levels = takewhile(lambda level: len(set(level)) == 1, zip(*regions, strict=False))
+    return tuple(level[0] for level in levels)
+
+
+class _Function:
+    """A graph as a function, which is written into a module behind those of its pipelines.
 
     A function that only one branch of a switch needs stands inside it, so that it runs only when that branch is chosen.
     What several branches need stands before the switch.
 
     Parameters
     ----------
+    module
+        The module; is added to.
     name
         What the function is called.
     cg, values
@@ -187,97 +220,95 @@ class _Part:
 
     Attributes
     ----------
-    root
-        The region of the graph itself.
-    branches
-        The regions of each switch that is written.
-    functions
-        All functions that are written, in run order.
-    tokens
-        The tokens that are made, read or wanted, in graph order.
-    references
+    regions
+        Where each function stands.
+    switches
+        By switch and token, the expressions of the values that choose it.
+    calls
         By function, the expression that refers to it.
-    pipelines
-        The functions that are pipelines, which are parts of their own.
     defaults
         By hyperparameter, the expression of its value.
-    keys
-        By function of a switch, the expressions of its selector's values, by value.
     variables
-        By token, its variable.
+        By token.
     """
 
     def __init__(
-        self, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: tuple[str, ...] | None, where: str = ""
+        self, module: _Module, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: Any, where: str = ""
     ) -> None:
-        self.name, self.cg, self.values, self.where = name, cg, values, where
+        self.module, self.name, self.cg, self.where = module, name, cg, where
         self.returns = cg.sink_tokens if wanted is None else wanted
-        self.root = _Region()
-        self.branches: dict[str, list[_Region]] = {}
-        self.functions, self.tokens = self._place(wanted is None)
-        self.references: dict[str, str] = {}
-        self.pipelines: dict[str, _Part] = {}
-        self.defaults: dict[str, str] = {}
-        self.keys: dict[str, dict[Hashable, str]] = {}
-        self.variables: dict[str, str] = {}
+        self.regions, tokens = _regions(cg, self.returns, wanted is None)
+        missing = [each for each in cg.placeholders if each in self.regions]
+        if missing:
+            raise PlaceholderNeeded(missing)
+        switches = {each: as_switch(cg.functions[each]) for each in self.regions}
+        self.switches = {each: self._keys(each, switch) for each, switch in switches.items() if switch is not None}
+        self.calls = {each: self._call(each) for each in self.regions if each not in self.switches}
+        self.defaults = {token: self._default(token, value) for token, value in values.items() if token in tokens}
+        self.variables = self._named(tokens)
+        module.texts.append(self._text())
 
-    def _place(self, is_whole: bool) -> tuple[list[str], list[str]]:
-        """Put each function that is needed into the innermost region around what needs it."""
-        cg, inside = self.cg, dict[str, _Region]()
-        used = dict.fromkeys(self.returns, self.root)
-        switches = set(cg.switches)
-        for name in reversed(tuple(cg.functions)):
-            made = cg.func_outputs(name)
-            regions = [used[token] for token in made if token in used]
-            if not regions and (made or not is_whole):
-                continue
-            inside[name] = region = _common(regions or [self.root])
-            read = [(token, region) for token in cg.func_inputs(name)]
-            if name in switches:
-                self.branches[name] = _branches(cg, name, region)
-                read = [read[0], *((branch.token, branch) for branch in self.branches[name])]
-            for token, reader in read:
-                used[token] = _common([used.get(token, reader), reader])
-        functions = [name for name in cg.functions if name in inside]
-        for name in functions:
-            inside[name].functions.append(name)
-        seen = {*used, *(token for name in functions for token in cg.func_outputs(name))}
-        return functions, [token for token in cg.tokens if token in seen]
+    def _call(self, name: str) -> str:
+        """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
+        module, function = self.module, called_by(self.cg.functions[name])
+        if not is_plain_pipeline(function):
+            return module.expression(f"Function {name!r}{self.where}", function, _NO_EXPRESSION, name)
+        if id(function) not in module.pipelines:
+            module.pipelines[id(function)] = inner = module.gathered.free_name(function.name)
+            where = f" of pipeline {function.name!r}"
+            _Function(module, inner, function.cg, function.runner.hyperparameters, None, where)
+        return module.pipelines[id(function)]
 
-    def text(self) -> str:
+    def _keys(self, name: str, switch: Switch) -> dict[str, list[str]]:
+        """Return the expressions of the values by which a switch chooses each token."""
+        found: dict[str, list[str]] = {}
+        for key, token in zip(switch.branches, self.cg.func_inputs(name)[1:], strict=True):
+            source = self.module.expression(f"Switch {name!r}{self.where} chooses {token!r}", key, _NO_KEY)
+            found.setdefault(token, []).append(source)
+        return found
+
+    def _default(self, token: str, value: Any) -> str:
+        """Return the expression of a hyperparameter's value: a short literal or name, or the constant that holds it."""
+        source = self.module.expression(f"Hyperparameter {token!r}{self.where}", value, _NO_VALUE)
+        is_simple = literal_source(value) or source.replace(".", "").isidentifier()
+        if is_simple and len(source) <= _LONGEST:
+            return source
+        return self.module.gathered.add_constant(token.upper(), source)
+
+    def _text(self) -> str:
         """Return the function."""
-        self.variables = variables = identifiers_of(self.tokens, self._hidden().__contains__)
+        variables = self.variables
         sources = [token for token in self.cg.source_tokens if token in variables]
-        given: list[Item] = [("", variables[token]) for token in sources if token not in self.defaults]
-        named = [(f"{variables[token]}=", self.defaults[token]) for token in sources if token in self.defaults]
-        given += [*[("", "*")][: len(named)], *named]
-        whole = f"def {self.name}({', '.join(before + source for before, source in given)}):"
-        head = [whole] if len(whole) <= LINE else one_per_line(f"def {self.name}(", given, "):")
-        body = [*self._docstring([*sources, *self.returns]), *self._region(self.root, 1)]
-        if self.returns:
-            returned = [variables[token] for token in self.returns]
-            source = f"({', '.join(returned)})"
-            is_short = len(returned) == 1 or len(source) + 9 <= LINE
-            body += laid_out(source[1:-1] if is_short else source, 1, "return ")
-        elif self.where:  # a function of another graph returns a value even if there is no token to return
-            body.append("    return ()")
-        return "\n".join([*head, *body])
+        given = [variables[token] for token in sources if token not in self.defaults]
+        named = [f"{variables[token]}={self.defaults[token]}" for token in sources if token in self.defaults]
+        given += ["*", *named] if named else []
+        head = f"def {self.name}({', '.join(given)}):"
+        lines = [head] if len(head) <= LINE else [f"def {self.name}(", *(f"    {each}," for each in given), "):"]
+        lines += [*self._docstring([*sources, *self.returns]), *self._lines(())]
+        returned = ", ".join(variables[token] for token in self.returns)
+        if returned:
+            is_line = len(self.returns) == 1 or len(returned) + len("    return ") <= LINE
+            lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")
+        return "\n".join(lines)
 
-    def _hidden(self) -> set[str]:
-        """Return the names of the module that the function uses: a variable of that name would hide them."""
-        keys = chain.from_iterable(values.values() for values in self.keys.values())
-        sources = [*self.references.values(), *(key for key in keys if not key.startswith(("'", '"')))]
-        tops = {source.partition(".")[0].partition("(")[0] for source in sources}
-        return {*tops, "ValueError"} if self.branches else tops
+    def _named(self, tokens: Iterable[str]) -> dict[str, str]:
+        """Return a variable for each token that hides nothing of the module; names that can stay come first."""
+        keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
+        taken = {name for source in {*self.calls.values(), *keys} for name in names_in(source)} | {"ValueError"}
+        found: dict[str, str] = {}
+        for token in sorted(tokens, key=lambda token: not is_identifier(token) or token in taken):
+            found[token] = identifier_of(token, taken.__contains__)
+            taken.add(found[token])
+        return found
 
-    def _region(self, region: _Region, depth: int) -> Iterator[str]:
+    def _lines(self, region: Region) -> Iterator[str]:
         """Give the lines of the functions of a region, and of the branches in it."""
-        for name in region.functions:
-            if name in self.branches:
-                yield from self._switch(name, depth)
-                continue
-            arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
-            yield from laid_out(f"{self.references[name]}({arguments})", depth, self._targets(name))
+        for name in (name for name, place in self.regions.items() if place == region):
+            if name in self.switches:
+                yield from self._switch(name, region)
+            else:
+                arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
+                yield from laid_out(f"{self.calls[name]}({arguments})", len(region) + 1, self._targets(name))
 
     def _targets(self, name: str) -> str:
         """Return what stands before the value of a function."""
@@ -287,18 +318,15 @@ class _Part:
         is_tuple_of_one = len(targets) == 1 and not self.cg.has_single_output(name)
         return f"({targets[0]},) = " if is_tuple_of_one else f"{', '.join(targets)} = "
 
-    def _switch(self, name: str, depth: int) -> Iterator[str]:
-        selector, keyword, pad = self.variables[self.cg.func_inputs(name)[0]], "if", "    " * depth
-        for branch in self.branches[name]:
-            keys = [self.keys[name][key] for key in branch.keys]
-            if len(keys) == 1 and keys[0] not in ("True", "False"):
-                operator, right = ("is" if keys[0] == "None" else "=="), keys[0]
-            else:
-                operator, right = "in", f"({', '.join(keys)}{',' if len(keys) == 1 else ''})"
-            yield from laid_out(right, depth, f"{keyword} {selector} {operator} ", ":")
-            body, targets = [*self._region(branch, depth + 1)], self._targets(name)
-            if targets:
-                body += laid_out(self.variables[branch.token], depth + 1, targets)
+    def _switch(self, name: str, region: Region) -> Iterator[str]:
+        depth, pad, keyword = len(region) + 1, "    " * (len(region) + 1), "if"
+        selector, targets = self.variables[self.cg.func_inputs(name)[0]], self._targets(name)
+        for token, keys in self.switches[name].items():
+            is_one = len(keys) == 1 and keys[0] not in ("None", "True", "False")
+            right = keys[0] if is_one else bracketed(tuple(keys), str)
+            yield from laid_out(right, depth, f"{keyword} {selector} {'==' if is_one else 'in'} ", ":")
+            body = [*self._lines((*region, (name, token)))]
+            body += laid_out(self.variables[token], depth + 1, targets) if targets else []
             yield from body or [f"{pad}    pass"]
             keyword = "elif"
         yield f"{pad}else:"
@@ -306,135 +334,12 @@ class _Part:
 
     def _docstring(self, shown: Iterable[str]) -> list[str]:
         """Return the docstring: what is returned, and which parameters and results have other names than tokens."""
-        summary = f"Return {', '.join(self.variables[token] for token in self.returns)}." if self.returns else "Run."
-        if len(summary) > LINE - 10:
-            summary = f"Return {len(self.returns)} values." if len(self.returns) > 1 else "Return the result."
+        returned = ", ".join(self.variables[token] for token in self.returns)
+        if len(returned) > LINE - len('    """Return ."""'):
+            returned = f"{len(self.returns)} values"
+        summary = f"Return {returned}." if returned else "Run."
         other = [token for token in dict.fromkeys(shown) if self.variables[token] != token]
         if not other:
             return [f'    """{summary}"""']
         lines = [f"        {self.variables[token]}: '{escaped(token, 40)}'" for token in other]
         return [f'    """{summary}', "", "    Tokens of the graph that have other names here:", "", *lines, '    """']
-
-
-def _branches(cg: CompGraph, name: str, around: _Region) -> list[_Region]:
-    """Return the branches of a switch; values of the selector that choose the same token choose the same branch."""
-    found: dict[str, _Region] = {}
-    for key, token in _keys(cg, name):
-        found.setdefault(token, _Region(around, around.depth + 1, token)).keys.append(key)
-    return list(found.values())
-
-
-def _keys(cg: CompGraph, name: str) -> Iterator[tuple[Hashable, str]]:
-    """Give the values of a switch's selector, each with the token that it chooses."""
-    function = as_switch(cg.functions[name])
-    yield from zip(function.branches if function is not None else (), cg.func_inputs(name)[1:], strict=True)
-
-
-def _common(regions: list[_Region]) -> _Region:
-    """Return the innermost region around all of these."""
-    found = regions[0]
-    for other in regions[1:]:
-        while found is not other:
-            if found.depth >= other.depth:
-                found = found.around or found
-            else:
-                other = other.around or other
-    return found
-
-
-def _wanted(cg: CompGraph, returns: Any) -> tuple[str, ...] | None:
-    """Return the tokens that are asked for, which are checked; None for the sink tokens."""
-    if returns is None:
-        return None
-    wanted = (returns,) if isinstance(returns, str) else tuple(returns) if isinstance(returns, Iterable) else (None,)
-    if not all(isinstance(token, str) for token in wanted):
-        kind = type(returns).__name__
-        raise TypeError(f'returns takes a token or a list of tokens, as ["edges"], not this {kind!r}.')
-    for token in wanted:
-        cg.require_token(token)
-    return wanted
-
-
-def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, Mapping[str, Any]]:
-    """Return a graph and the values of its hyperparameters, which are checked."""
-    if isinstance(given, CompGraphRunner | Pipeline):
-        runner = given.runner if isinstance(given, Pipeline) else given
-        cg, known = given.cg, runner.hyperparameters
-    else:
-        cg, known = given, getattr(given, "defaults", {})
-    if not isinstance(hparams, Mapping | None):
-        kind = type(hparams).__name__
-        raise TypeError(f"hparams takes the values of hyperparameters by token, such as a dict, not {kind!r}.")
-    values = {**known, **(hparams or {})}
-    CompGraphRunner(cg, values)  # raises for what is no graph, and for what can't be a hyperparameter
-    return cg, values
-
-
-def _with_pipelines(top: _Part) -> list[_Part]:
-    """Return the parts of the pipelines that a part calls, and of those that they call, then the part itself."""
-    by_pipeline: dict[int, _Part] = {}
-    found, pending = [top], [top]
-    while pending:
-        part = pending.pop()
-        for name in part.functions:
-            pipeline = called_by(part.cg.functions[name])
-            if not is_plain_pipeline(pipeline):
-                continue
-            if id(pipeline) not in by_pipeline:
-                where = f" of pipeline {pipeline.name!r}"
-                inner = _Part(pipeline.name, pipeline.cg, pipeline.runner.hyperparameters, None, where)
-                by_pipeline[id(pipeline)] = inner
-                found.append(inner)
-                pending.append(inner)
-            part.pipelines[name] = by_pipeline[id(pipeline)]
-    return found[::-1]
-
-
-def _unwritable(parts: Sequence[_Part], name: str, wanted: Sequence[str] | None) -> Iterator[str]:
-    """Give what stands against writing these parts, whatever their functions are."""
-    if not is_identifier(name) or hasattr(builtins, name):
-        yield f"name={name!r} can't be a function's name. Give a word that means nothing to Python."
-    if wanted == ():
-        yield "returns is empty: name at least one token, or leave it out for the sink tokens."
-    for part in parts:
-        if any(region.depth > _DEEPEST for regions in part.branches.values() for region in regions):
-            text = f"The switches{part.where} stand in one another too deep to be indented."
-            yield f"{text} Make the inner ones a Pipeline, which becomes a function of its own."
-
-
-def _slice(gathered: Slice, parts: Sequence[_Part]) -> None:
-    """Gather what the functions need, and note by which expressions they are called."""
-    for part in parts:
-        for name in part.functions:
-            if name not in part.branches and name not in part.pipelines:
-                what, function = f"Function {name!r}{part.where}", called_by(part.cg.functions[name])
-                part.references[name] = expression_or_none(gathered, function, what, _NO_EXPRESSION, name)
-    for part in parts:
-        if part.where:  # its name must hide nothing
-            part.name = gathered.free_name(part.name)
-    for part in parts:
-        part.references.update({name: inner.name for name, inner in part.pipelines.items()})
-
-
-def _write_values(gathered: Slice, part: _Part) -> None:
-    """Write the expressions of hyperparameters and of the values that switches compare."""
-    for token, value in part.values.items():
-        if token in part.tokens:
-            part.defaults[token] = _default(gathered, f"Hyperparameter {token!r}{part.where}", token, value)
-    for name in part.branches:
-        what = f"Switch {name!r}{part.where}"
-        part.keys[name] = {
-            key: expression_or_none(
-                gathered, key, what, f"chooses {token!r} by a key of type {{kind}}, which no expression makes again. "
-                "Choose by strings or numbers."
-            )
-            for key, token in _keys(part.cg, name)
-        }  # fmt: skip
-
-
-def _default(gathered: Slice, what: str, token: str, value: Any) -> str:
-    """Return the expression of a hyperparameter's value: as it is, or the constant above that holds it."""
-    source = expression_or_none(gathered, value, what, _NO_VALUE)
-    if literal_source(value) or source.replace(".", "").isidentifier():
-        return source
-    return gathered.add_constant(token.upper(), source)

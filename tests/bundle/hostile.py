@@ -197,7 +197,6 @@ REFUSED: dict[str, tuple[str, str, str]] = {
         "def make(n):\n    def f(a):\n        nonlocal n\n        n += 1\n        return n\n    return f\nf = make(0)", "f",
         r"changes 'n' of the function around it \(cell \[1\], line 3\).*Make it a token",
     ),
-    "big array": ("K = np.zeros(3_000_000)\ndef f(a):\n    return a + K[0]", "f", r"\(cell \[1\], line 3\).* (16 MB are the most\. Pass it in as|of type ndarray\. Make K) a token"),
     "dict that is written into": ("SEEN = {}\ndef f(a):\n    SEEN[a.size] = 1\n    return a", "f", r"writes into 'SEEN', .*\(cell \[1\], line 3\).* Copy it first"),
     "list that grows": ("LOG = []\ndef f(a):\n    LOG.append(a)\n    return a", "f", r"writes into 'LOG', .*\(cell \[1\], line 3\)"),
     "attribute of itself": ("def f(a):\n    f.count = 1\n    return a", "f", r"writes into 'f', .*\(cell \[1\], line 2\)"),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import epypes as ep
 from epypes.bundle.equivalence import refusal
-from epypes.bundle.graphs import Graphs
-from epypes.bundle.module import emit_module
+from epypes.bundle.module import Graphs, emit_module
 from epypes.bundle.settings import Settings
 from epypes.bundle.slice import gather
 
@@ -16,7 +15,7 @@ def slice_graph(functions):
     The module is executed and compared with the functions, as a promotion does.
     """
     cg = ep.CompGraph(functions, {name: ("x", f"{name}_made") for name in functions}, types=False)
-    gathered, written = gather(lambda needed: Graphs(needed).write(cg).references)
+    gathered, written = gather(lambda needed: Graphs(needed).write(cg))
     if not gathered.refusals:
         text = emit_module(Settings("case", ("x",), ("y",), {}), cg, gathered, written)
         why = refusal(text, {}, lambda made: _pairs(functions, made))
