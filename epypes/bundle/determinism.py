@@ -15,7 +15,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Final
@@ -25,6 +25,7 @@ from epypes.bundle.compare import Difference, add_tolerances
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS
 from epypes.bundle.manifest import write_manifest
 from epypes.bundle.replay import (
+    PRINT_OPTIONS,
     REPLAY_TIMEOUT_S,
     ReplayReport,
     library_settings,
@@ -175,7 +176,9 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         refused |= {
             entry.token for entry in found if not entry.is_noise and (entry.token, entry.function) != (ANSWER, "f_out")
         }
-        reasons = _changed_settings(usual)
+        changed = _changed_settings(usual)
+        notes = [changed.pop(PRINT_OPTIONS)] if PRINT_OPTIONS in changed else []
+        reasons = [*changed.values()]
         if refused or usual.outside or not usual.tokens:
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
@@ -185,7 +188,7 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         _tolerate(draft, [entry for entry in found if entry.token != ANSWER])
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
     write_manifest(draft, usual.environment)
-    return usual
+    return replace(usual, notes=[*usual.notes, *notes])
 
 
 def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, changed: Sequence[Condition]) -> ReplayReport:
@@ -202,15 +205,15 @@ def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, change
         return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
 
 
-def _changed_settings(usual: ReplayReport) -> list[str]:
-    """Return how this process has set libraries that are set otherwise in a fresh one, as reasons."""
+def _changed_settings(usual: ReplayReport) -> dict[str, str]:
+    """Return by name what this process has set in libraries that is set otherwise in a fresh one, as sentences."""
     here = library_settings()
-    return [
-        f"The notebook has changed {name} ({here[name]}); a service has it as it is by default ({default}). "
+    return {
+        name: f"The notebook has changed {name} ({here[name]}); a service has it as it is by default ({default}). "
         "Change it inside the function that needs it, or set it back."
         for name, default in usual.library_settings.items()
         if here.get(name, default) != default
-    ]
+    }
 
 
 def _own_reasons(draft: Path, usual: ReplayReport, refused: Collection[str]) -> list[str]:

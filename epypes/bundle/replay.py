@@ -55,6 +55,8 @@ _UNKNOWN: Final = (
     "Neither the bundle nor what it runs on has changed as far as is known: a function may depend on something that is "
     "not a token, such as a file, the current folder, or what was installed beside its package."
 )
+# They change the texts of arrays alone.
+PRINT_OPTIONS: Final = "numpy.set_printoptions"
 _SYSTEM: Final = (
     *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
     *("/System", "/Library", "/var/cache", "/var/lib"),
@@ -400,6 +402,7 @@ def library_settings() -> dict[str, str]:
     if numpy is not None:
         raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
         found["numpy.seterr"] = f"{raising or 'no errors are raised'}"
+        found[PRINT_OPTIONS] = f"{numpy.get_printoptions()}"
     if cv2 is not None:
         found["cv2.setUseOptimized"] = f"{cv2.useOptimized()}"
     if decimal is not None:

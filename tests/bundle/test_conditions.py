@@ -154,6 +154,16 @@ def test_a_library_that_the_notebook_has_set_otherwise_is_named(change, undo, na
         exec(undo, names)
 
 
+def test_changed_print_options_of_numpy_are_noted(tmp_path):
+    names = cell("import numpy as np\ndef use(x):\n    return str(x) if x.max() > 1e6 else 'small'")
+    runner = ep.CompGraphRunner(ep.CompGraph({"use": names["use"]}, {"use": ("x", "used")}))
+    runner.run(x=X)
+    notes = []
+    with np.printoptions(precision=2):
+        ep.promote(runner, tmp_path / "bundle", on_progress=notes.append)
+    assert any("The notebook has changed numpy.set_printoptions" in note for note in notes)
+
+
 def test_lines_that_no_sample_runs_are_named(tmp_path):
     source = "def use(x):\n    if x.max() > 2:\n        x = x / 2\n        x = x + 1\n    return x"
     runner = ep.CompGraphRunner(ep.CompGraph({"use": cell(source)["use"]}, {"use": ("x", "used")}))
