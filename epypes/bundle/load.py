@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
 from epypes.bundle.manifest import bundle_files, check_manifest
-from epypes.bundle.mutable_state import MutableState, check_caches
+from epypes.bundle.mutable_state import MutableState
 from epypes.bundle.settings import Settings, StoredArray, load_array, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -106,7 +106,6 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
             break
     try:
         own = {name: getattr(module, name) for name in settings.own}
-        check_caches(vars(module))
         ports = {name: port for name, port in own.items() if name != MAKER}
         state = MutableState({**module.func_dict, **ports})
         cg = _graph(module, state.guarded(module.func_dict), settings)
