@@ -112,7 +112,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         own |= {name: called_for(name, port) for name, port in state.guarded(ports).items()}
     except (AttributeError, KeyError, TypeError) as error:
         missing = repr(error.name) if isinstance(error, AttributeError) else error
-        text = f"{folder / MODULE} has no {missing} that {SETTINGS} names. Promote the graph again."
+        text = f"{folder / MODULE} defines no {missing}, which the bundle needs. Promote the graph again."
         raise BundleError(folder, text) from error
     return Bundle(folder, cg, replace(settings, hyperparameters=values), digest, own, enums)
 
@@ -134,14 +134,9 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     return found.st_ino, found.st_ctime_ns
 
 
-def module_name(folder: Path) -> str:
-    """Return the name that the module of a bundle has while it is executed."""
-    return f"epypes_bundle_{folder.name}"
-
-
 def execute(path: Path, source: bytes) -> Any:
     """Execute the module's source as it was checked; a cached .pyc, which the manifest does not cover, is not read."""
-    module = types.ModuleType(module_name(path.parent))
+    module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
     module.__file__ = str(path)
     # While their module runs, dataclasses look for it there.
     before = sys.modules.get(module.__name__)

@@ -75,24 +75,19 @@ class CodeSnapshot(Snapshot):
     ----------
     functions
         The functions by name.
-    lock
-        Whether arrays are locked instead of compared.
     compared
-        Arrays that are not locked in any case, by id.
+        The arrays that are not locked but compared, by id; those of libraries' objects are added.
+    lock
+        Whether all others are locked; else they are added too.
 
     Attributes
     ----------
-    arrays
-        The arrays that were found, by id.
     settlers
         What puts back or forgets, after each call, what a call may change without a failure.
     """
 
-    def __init__(
-        self, functions: Mapping[str, object], *, lock: bool = True, compared: Mapping[int, object] | None = None
-    ) -> None:
-        self._lock, self._compared = lock, dict(compared or {})
-        self.arrays: dict[int, object] = {}
+    def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
+        self._compared, self._lock = compared, lock
         self.settlers: list[Callable[[], object]] = []
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
         self._code: set[str] = set()  # its names and instructions
@@ -169,10 +164,11 @@ class CodeSnapshot(Snapshot):
 
     def look_at_array(self, name: str, value: Any) -> Found:
         """Lock an array, instead of making a copy of it to compare with."""
-        self.arrays[id(value)] = value
         if self._lock and id(value) not in self._compared:
             value.setflags(write=False)
             self._compare(_UNLOCKS, functools.partial(array_record, name, value))
+        else:
+            self._compared[id(value)] = value
         return super().look_at_array(name, value)
 
     def _look_at_function(self, function: types.FunctionType) -> Found:
@@ -210,15 +206,17 @@ class CodeSnapshot(Snapshot):
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):
-            _check_caches(kind)
-            self._compare(_BINDS, functools.partial(_Bindings, f"{kind.__name__}.", kind))
-            yield from ((f"{kind.__name__}.{name}", value) for name, value in _bound(kind).items())
+            yield from self._look_at_names(f"{kind.__name__}.", kind)
             yield from ((base.__name__, base) for base in kind.__bases__)
 
     def _look_at_module(self, module: types.ModuleType) -> Found:
         if is_own(module.__name__):
-            self._compare(_BINDS, functools.partial(_Bindings, f"{module.__name__}.", vars(module)))
-            yield from ((name, value) for name, value in vars(module).items() if name not in _OF_PYTHON)
+            yield from self._look_at_names(f"{module.__name__}.", vars(module))
+
+    def _look_at_names(self, prefix: str, owner: Any) -> Found:
+        _check_caches(owner)
+        self._compare(_BINDS, functools.partial(_Bindings, prefix, owner))
+        yield from ((f"{prefix}{name}", value) for name, value in _bound(owner).items() if name not in _OF_PYTHON)
 
     def _look_at_node(self, name: str, node: Node) -> Found:
         """Look into a node of a nested graph; what EPypes itself has in it is no state of the user's."""
@@ -366,7 +364,7 @@ def _checked(cached: Any, name: str) -> Any:
 
     def compute(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        snapshot = CodeSnapshot({name: result})  # locks its arrays
+        snapshot = CodeSnapshot({name: result}, {})  # locks its arrays
         if snapshot:
             if len(values) >= _MOST_VALUES:
                 made.cache_clear()
@@ -403,7 +401,7 @@ class MutableState:
         for name, function in _with_inner(functions):
             if is_unguarded(function):
                 # It rejects read-only arrays.
-                self._compared |= CodeSnapshot({name: function}, lock=False).arrays
+                CodeSnapshot({name: function}, self._compared, lock=False)
 
     def guarded(self, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
         """Have runners and nodes call what compares the state of these functions; return them, odd kinds wrapped.
@@ -419,7 +417,7 @@ class MutableState:
             self.guarded(function.network.nodes)
             return function
         function = _checked(function, name)
-        snapshot = CodeSnapshot({name: function}, compared=self._compared)
+        snapshot = CodeSnapshot({name: function}, self._compared)
         if not snapshot:
             return function
         if type(function) in (types.FunctionType, functools.partial, _CACHED):
