@@ -339,11 +339,7 @@ def alike(entry: Mapping[str, Any], value: Any) -> Any:
 
 def fits(value: Any) -> bool:
     """Whether an entry holds a value to the last bit."""
-    try:
-        written(value)
-    except Unwritable:
-        return False
-    return True
+    return not unwritable({"": value})
 
 
 def written(value: Any) -> dict[str, Any]:

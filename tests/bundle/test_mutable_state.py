@@ -441,6 +441,49 @@ def f(x):
     assert {*answers[1::2]} == {"1" if "CACHES" in items or "property" in items else "StateChanged"}
 
 
+MIXED = """
+L = []
+@functools.cache
+def total(): return len(L)
+@functools.cache
+def items(): return []
+class C:
+    @functools.cached_property
+    def items(self): return []
+c = C()
+def f(x):
+    if x == 1: L.append(x)
+    if x == 2: items().append(x)
+    return len(L) + len(items()) + total()
+def g(x):
+    if x == 3: L.append(x)
+    if x == 4: c.items.append(x)
+    return len(L) + len(c.items)
+func_dict, func_io = {"f": f, "g": g}, {"f": ("x", "y"), "g": ("x", "z")}
+"""
+
+
+def test_events_beside_those_that_change_something_neither_fail_nor_see_it(tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", MIXED))
+
+    def answers(x):
+        try:
+            return (*runner.run(x=x).values(),)[1:]
+        except StateChanged as error:
+            return error.function, error.changed
+
+    events = [*range(9)] * 150
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-4)
+    try:
+        with ThreadPoolExecutor(12) as pool:
+            found = [*pool.map(answers, events)]
+    finally:
+        sys.setswitchinterval(before)
+    expected = {1: ("f", "L"), 2: ("f", "items"), 3: ("g", "L"), 4: (0, 1)}
+    assert found == [expected.get(x, (0, 0)) for x in events]
+
+
 def test_calls_that_change_nothing_run_at_the_same_time(tmp_path):
     source = """
     import threading
