@@ -150,11 +150,11 @@ class CodeSnapshot(Snapshot):
     def _look_at_object(self, name: str, value: Any) -> Found:
         kind, attributes = type(value), getattr(value, "__dict__", None)
         if kind is dict:
-            _check_caches(value, name)
+            _check_caches(value)
         elif is_own(str(kind.__module__)):
             yield kind.__name__, kind
             if type(attributes) is dict:
-                _check_caches(attributes, name)
+                _check_caches(attributes)
             lazy = cached_properties(kind)
             if lazy:
                 self.settlers.append(functools.partial(_forget, value, lazy))
@@ -184,7 +184,7 @@ class CodeSnapshot(Snapshot):
             is_imported = f"IMPORT_NAME {name}" in self._code
             yield name, known.get(name, sys.modules.get(name) if is_imported else None)
         for name, cell in _cells(function):
-            cell.cell_contents = _checked(cell.cell_contents, name)
+            cell.cell_contents = _checked(cell.cell_contents)
             self._compare(_BINDS, functools.partial(Record, name, cell, _read_cell, _write_cell))
             yield name, cell.cell_contents
         arguments = code.co_varnames[: code.co_argcount]
@@ -343,21 +343,21 @@ def _write_cell(cell: types.CellType, saved: tuple[Any, ...]) -> None:
 # -- caches --------------------------------------------------------------------------------------------------------
 
 
-def _check_caches(owner: Any, name: str = "") -> None:
+def _check_caches(owner: Any) -> None:
     """Replace each lru_cache among the values of a dict or the attributes of a class by one that is compared."""
-    for key, part in [*(owner if type(owner) is dict else vars(owner)).items()]:
-        checked = _checked(part, name or key)
-        if checked is not part:
-            if type(owner) is dict:
-                owner[key] = checked
-            else:
-                type.__setattr__(owner, key, checked)
+    names = owner if type(owner) is dict else vars(owner)
+    for name, part in [*names.items()]:
+        checked = _checked(part)
+        if checked is not part and isinstance(owner, type):
+            type.__setattr__(owner, name, checked)
+        elif checked is not part:
+            names[name] = checked
 
 
-def _checked(cached: Any, name: str) -> Any:
+def _checked(cached: Any) -> Any:
     """Return a cache of the same function whose values are compared; what is no lru_cache of the user's as it is."""
     if type(cached) in (staticmethod, classmethod):
-        checked = _checked(cached.__func__, name)
+        checked = _checked(cached.__func__)
         return cached if checked is cached.__func__ else type(cached)(checked)
     if type(cached) is not _CACHED or not is_own(str(cached.__module__)):
         return cached
@@ -368,7 +368,7 @@ def _checked(cached: Any, name: str) -> Any:
 
     def compute(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        snapshot = CodeSnapshot({name: result}, {})  # locks its arrays
+        snapshot = CodeSnapshot({"": result}, {})  # locks its arrays
         if snapshot:
             if len(values) >= _MOST_VALUES:
                 made.cache_clear()
@@ -420,7 +420,7 @@ class MutableState:
         if isinstance(function, Pipeline):
             self.guarded(function.network.nodes)
             return function
-        function = _checked(function, name)
+        function = _checked(function)
         snapshot = CodeSnapshot({name: function}, self._compared)
         if not snapshot:
             return function
@@ -439,17 +439,15 @@ class MutableState:
     def _guarded_call(self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot) -> Callable[..., Any]:
         turns = self._turns
 
-        def attempt(args: Any, kwargs: Any) -> tuple[Any, BaseException | None, str | None]:
-            """Return the result, or the exception, and the name of what has changed."""
-            token, result, error = _under_way.set(turns), None, None
+        def attempt(args: Any, kwargs: Any) -> tuple[Any, BaseException | None]:
+            token = _under_way.set(turns)
             try:
-                result = function(*args, **kwargs)
-            except BaseException as raised:
-                error = raised
+                return function(*args, **kwargs), None
+            except BaseException as error:
+                return None, error
             finally:
                 _under_way.reset(token)
-            snapshot.settle()
-            return result, error, snapshot.changed()
+                snapshot.settle()
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -461,12 +459,14 @@ class MutableState:
                     turns.claim(number)
                     if snapshot.changed() is not None:  # by a call that waits to put it back
                         snapshot.restored()
-                result, error, changed = attempt(args, kwargs)
+                result, error = attempt(args, kwargs)
+                changed = snapshot.changed()
                 if changed is not None and not is_alone:
                     is_alone = True
                     if not turns.claim(number):
                         snapshot.restored()
-                        result, error, changed = attempt(args, kwargs)
+                        result, error = attempt(args, kwargs)
+                        changed = snapshot.changed()
                 if changed is not None:
                     is_restored = snapshot.restored()
             finally:
