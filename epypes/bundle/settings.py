@@ -37,13 +37,14 @@ _LINE: Final = 100
 _COMMENT: Final = (
     "What the graph in pipeline.py is run with. The manifest covers it: change a value in the notebook and promote."
 )
-_WAY_OUT: Final = (
-    ", which pipeline.toml can't hold. Use numbers, strings, small arrays or tuples, lists and dicts of them"
+_UNWRITABLE: Final = (
+    "is {}, which pipeline.toml can't hold. Use numbers, strings, a small array or tuples, lists and dicts of them; "
+    "make it in a function"
 )
-_WAY_OUT_OF_LARGE: Final = (
-    f"; {MOST_NUMBERS} are the most that pipeline.toml holds, where people read them. Make each array a hyperparameter "
-    "of its own, or let the function read it from a variable of the notebook, outside of it: the bundle has either as "
-    "a file"
+_TOO_LARGE: Final = (
+    f"is or holds {{}}; {MOST_NUMBERS} are the most that pipeline.toml holds, where people read them. Make each array "
+    "a hyperparameter of its own, or let the function read it from a variable of the notebook, outside of it: the "
+    "bundle has either as a file. Or make it in a function"
 )
 # What stands before the lines that need a word.
 _COMMENTS: Final = {
@@ -55,10 +56,11 @@ _COMMENTS: Final = {
 
 
 class Unwritable(ValueError):
-    """A value that no entry holds to the last bit; its text says of which kind it is, and what to do instead."""
+    """A value that no entry holds to the last bit; its text says of which kind it is, ``reason`` what to do instead."""
 
-    def __init__(self, kind: str, way_out: str = _WAY_OUT) -> None:
-        super().__init__(f"{kind}{way_out}; make it in a function")
+    def __init__(self, kind: str, reason: str = _UNWRITABLE) -> None:
+        super().__init__(kind)
+        self.reason = reason.format(kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +121,7 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
         try:
             written(value)
         except Unwritable as error:
-            reasons.append(f"{what} {token!r} is {error}; or {last}.")
+            reasons.append(f"{what} {token!r} {error.reason}; or {last}.")
     return reasons
 
 
@@ -401,7 +403,7 @@ def _array(array: Any) -> dict[str, Any]:
     if not _is_exact(array.dtype):
         raise Unwritable(f"an array of {array.dtype}")
     if array.size > MOST_NUMBERS:
-        raise Unwritable(f"an array of {array.size} numbers", _WAY_OUT_OF_LARGE)
+        raise Unwritable(f"an array of {array.size} numbers", _TOO_LARGE)
     import numpy as np
 
     numbers = np.array([_of_number(number) for number in array.flat], object)
