@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
 from epypes.bundle.manifest import bundle_files, check_manifest
-from epypes.bundle.mutable_state import MutableState, check_caches
+from epypes.bundle.mutable_state import MutableState
 from epypes.bundle.settings import Settings, StoredArray, load_array, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -106,7 +106,6 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
             break
     try:
         own = {name: getattr(module, name) for name in settings.own}
-        check_caches(vars(module))
         ports = {name: port for name, port in own.items() if name != MAKER}
         state = MutableState({**module.func_dict, **ports})
         cg = _graph(module, state.guarded(module.func_dict), settings)
@@ -135,14 +134,9 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     return found.st_ino, found.st_ctime_ns
 
 
-def module_name(folder: Path) -> str:
-    """Return the name that the module of a bundle has while it is executed."""
-    return f"epypes_bundle_{folder.name}"
-
-
 def execute(path: Path, source: bytes) -> Any:
     """Execute the module's source as it was checked; a cached .pyc, which the manifest does not cover, is not read."""
-    module = types.ModuleType(module_name(path.parent))
+    module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
     module.__file__ = str(path)
     # While their module runs, dataclasses look for it there.
     before = sys.modules.get(module.__name__)

@@ -32,7 +32,7 @@ _LINES: Final = "lines of "
 # Bounds on what is read and hashed of a folder that may be anything. Samples and weights are large, text is not.
 MOST_BYTES: Final = 8 * 1024**3
 MOST_FILES: Final = 10_000
-_MOST_TEXT_BYTES: Final = 64 * 1024**2
+_MOST_TEXT_MB: Final = 64
 
 
 def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -> str:
@@ -70,13 +70,19 @@ def check_manifest(folder: Path) -> str:
         There is no bundle, or something in it is not a regular file or is too large.
     """
     if not os.path.lexists(folder / MANIFEST):
-        raise BundleError(folder, _no_bundle(folder))
+        if folder.is_dir():
+            text = f"{folder} is not a bundle: it has no {MANIFEST}. Name the folder that epypes promote wrote."
+        elif folder.exists():
+            text = f"{folder} is a file. Name the folder of a bundle, which epypes promote writes."
+        else:
+            text = f"{folder} does not exist. Make a bundle with: epypes promote NOTEBOOK --to {folder}"
+        raise BundleError(folder, text)
     present = bundle_files(folder)
     recorded, facts = _read_manifest(folder)
     findings = [f"{name} is missing" for name in recorded if name not in present]
     findings += [f"{name} was added" for name in present if name not in recorded]
     findings += [
-        f"{name} was changed{_changed_line(folder, name, facts)}"
+        f"{name} was changed{_changed_line(folder / name, facts.get(_LINES + name))}"
         for name, value in recorded.items()
         if name in present and _hash(folder / name) != value
     ]
@@ -112,47 +118,37 @@ def _sums(path: Path) -> str:
     return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in path.read_bytes().splitlines())
 
 
-def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
+def _changed_line(path: Path, sums: str | None) -> str:
     """Return where a text was changed first, as ``" at line 3: ..."``; "" if that is not known."""
-    if f"{_LINES}{name}" not in facts:
+    if sums is None:
         return ""
-    path = folder / name
-    before, now = facts[_LINES + name].split(), _sums(path).split()
-    changes = difflib.SequenceMatcher(None, before, now, autojunk=False).get_opcodes()
-    what, first, _, at, _ = next((change for change in changes if change[0] != "equal"), ("", 0, 0, 0, 0))
-    if what == "delete":
-        return f", where line {first + 1} is missing"
-    text = [*path.read_bytes().decode(errors="replace").splitlines(), ""][at].strip()
-    return f" at line {at + 1}: {text:.80}" if what else ""
-
-
-def _no_bundle(folder: Path) -> str:
-    if folder.is_dir():
-        return f"{folder} is not a bundle: it has no {MANIFEST}. Name the folder that epypes promote wrote."
-    if folder.exists():
-        return f"{folder} is a file. Name the folder of a bundle, which epypes promote writes."
-    return f"{folder} does not exist. Make a bundle with: epypes promote NOTEBOOK --to {folder}"
+    matcher = difflib.SequenceMatcher(None, sums.split(), _sums(path).split(), autojunk=False)
+    for what, first, _, at, _ in matcher.get_opcodes():
+        if what == "delete":
+            return f", where line {first + 1} is missing"
+        if what != "equal":
+            return f" at line {at + 1}: {path.read_bytes().splitlines()[at].decode(errors='replace').strip():.80}"
+    return ""
 
 
 def _read_manifest(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
     """Return the digests of a manifest by file, and the facts in its comments by name."""
     path = folder / MANIFEST
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BundleError(folder, f"{path} can't be read: {error}. Promote again.") from error
     recorded: dict[str, str] = {}
     facts: dict[str, str] = {}
-    for line in lines:
-        if line.startswith(_FACT):
-            name, _, value = line.removeprefix(_FACT).partition(": ")
-            facts[name] = value
-            continue
-        value, spaces, name = line.partition("  ")
-        if not spaces:
-            raise BundleError(folder, f"{path} can't be read: {line!r:.60} is no line of it. Promote again.")
-        if recorded.setdefault(name, value) != value:
-            raise BundleError(folder, f"{path} has two digests for {name!r}. Promote again.")
+    try:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if line.startswith(_FACT):
+                name, _, value = line.removeprefix(_FACT).partition(": ")
+                facts[name] = value
+                continue
+            value, spaces, name = line.partition("  ")
+            if not spaces:
+                raise ValueError(f"{line!r:.60} is no line of it")
+            if recorded.setdefault(name, value) != value:
+                raise ValueError(f"it has two digests for {name!r}")
+    except (OSError, ValueError) as error:
+        raise BundleError(folder, f"{path} can't be read: {error}. Promote again.") from error
     return recorded, facts
 
 
@@ -173,9 +169,9 @@ def bundle_files(folder: Path) -> list[str]:
             continue
         if not stat.S_ISREG(status.st_mode):
             raise BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
-        if name.as_posix() in (*_TEXTS, MANIFEST) and status.st_size > _MOST_TEXT_BYTES:
-            limit = f"{_MOST_TEXT_BYTES // 1024**2} MB"
-            raise BundleError(folder, f"{path} is larger than {limit}, which no text of a bundle is. Promote again.")
+        if name.as_posix() in (*_TEXTS, MANIFEST) and status.st_size > _MOST_TEXT_MB * 1024**2:
+            text = f"{path} is larger than {_MOST_TEXT_MB} MB, which no text of a bundle is. Promote again."
+            raise BundleError(folder, text)
         total_bytes += status.st_size
         if total_bytes > MOST_BYTES:
             limit = f"{MOST_BYTES // 1024**3} GB"

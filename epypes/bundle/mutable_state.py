@@ -5,14 +5,18 @@ syntax can't show all of it. So each function of a loaded bundle that refers to 
 call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged.
 Functions that refer only to constants, which are most, are not wrapped.
 
-What code can change is read off its instructions: bindings of names and attributes are only compared where some of the
-code can set them, and locked arrays only where some of it can unlock them.
+Names and attributes are compared where some of the code can bind them, and locked arrays where some of it can unlock
+them; its instructions show that. To wrap every function and compare always takes 5 us per call: 27 % of an event of the
+edge graph on an image of 64 x 64.
 
-A value in the cache of an ``lru_cache`` is compared with what it was when it was computed, and taken out if it has
-changed. What a cached property has computed is forgotten after the call. The attributes of a node of the user's own
-class are put back without a failure, since it may count its calls; what a pipeline of the user's own class has in its
-attributes is not looked at. The global generators of ``random`` and ``numpy.random`` are not compared: a function may
-seed them for another one, and the replay finds draws without a seed.
+A value in the cache of an ``lru_cache`` is compared with what it was when it was computed. For that, the cache is
+replaced by another one of the same function when the bundle is loaded, wherever a name, an attribute, a dict or a
+closure holds it. What can't be compared is forgotten or put back after each call, without a failure: what a cached
+property has computed, a cache that is held elsewhere, and the attributes of a node of the user's own class, which may
+count its calls. A function that reaches one of these never runs beside another one.
+
+What a pipeline of the user's own class has in its attributes is not looked at. The global generators of ``random`` and
+``numpy.random`` are not compared: a function may seed them for another one, and the replay finds draws without a seed.
 
 Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.
@@ -26,7 +30,6 @@ import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Final
 
@@ -34,38 +37,22 @@ from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
-from epypes.run.snapshot import (
-    Found,
-    Record,
-    Snapshot,
-    array_record,
-    as_dict,
-    cached_properties,
-    cached_values,
-    is_own,
-    is_same,
-)
+from epypes.run.snapshot import Found, Record, Snapshot, array_record, as_dict, cached_properties, is_own, is_same
 
 _CACHED: Final = type(functools.cache(len))
-# The attribute of an lru_cache whose values are compared.
-_CHECK: Final = "__epypes_check__"
-# A cache is emptied when it has computed more values that must be compared at each call.
-_MOST_CHECKED: Final = 1_000
-# Code with one of these names or instructions can bind the names of its module; with one of the second set, the
-# attributes of any object; with one of the third, it can unlock or reshape an array.
+# An attribute of an lru_cache: the one that takes its place.
+_CHECKED: Final = "__epypes_checked__"
+# An attribute of that one: the snapshots of its mutable values.
+_VALUES: Final = "__epypes_values__"
+# A cache is emptied when it has more values than this that must be compared at each call.
+_MOST_VALUES: Final = 1_000
+# Code with one of these names or instructions can bind names of its module, of closures, or attributes; code with one
+# of the second set can unlock or reshape an array.
 _BINDS: Final = frozenset(
-    {"globals", "exec", "eval", "vars", "__globals__", "__dict__", "modules", "f_globals"}
-    | {"STORE_GLOBAL", "DELETE_GLOBAL"}
+    {"globals", "exec", "eval", "vars", "setattr", "delattr", "modules", "f_globals", "__globals__", "__dict__"}
+    | {"__setattr__", "__delattr__", "__defaults__", "STORE_ATTR", "DELETE_ATTR", "STORE_GLOBAL", "DELETE_GLOBAL"}
+    | {"nonlocal"}
 )
-_SETS: Final = _BINDS | {
-    "setattr",
-    "delattr",
-    "__setattr__",
-    "__delattr__",
-    "__defaults__",
-    "STORE_ATTR",
-    "DELETE_ATTR",
-}
 _UNLOCKS: Final = frozenset(
     {"setflags", *(f"STORE_ATTR {name}" for name in ("writeable", "shape", "dtype", "strides", "data"))}
 )
@@ -89,51 +76,60 @@ class CodeSnapshot(Snapshot):
     ----------
     functions
         The functions by name.
-    lock
-        Whether arrays are locked instead of compared, and caches emptied instead of looked into.
     compared
-        Arrays that are not locked in any case, by id.
+        The arrays that are not locked but compared, by id; those of libraries' objects are added.
+    lock
+        Whether all others are locked; else they are added too.
+
+    Attributes
+    ----------
+    settlers
+        What puts back or forgets, after each call, what a call may change without a failure.
     """
 
-    def __init__(
-        self, functions: Mapping[str, object], *, lock: bool = True, compared: Mapping[int, object] | None = None
-    ) -> None:
-        self._lock, self._compared = lock, dict(compared or {})
-        self.arrays: dict[int, object] = {}
-        self._settlers: list[Callable[[], None]] = []
-        self._caches: list[_CacheCheck] = []
-        self._instructions: set[str] = set()
-        # Records of what only some instructions can change.
-        self._possible: list[tuple[frozenset[str], Callable[[], Record]]] = []
+    def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
+        self._compared, self._lock = compared, lock
+        self.settlers: list[Callable[[], object]] = []
+        self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
+        self._code: set[str] = set()  # its names and instructions
+        # What is compared or settled if the code has one of the names or instructions.
+        self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
         super().__init__(functions)
-        self.records += [make() for needed, make in self._possible if needed & self._instructions]
+        for needed, add in self._possible:
+            if needed & self._code:
+                add()
         self._possible.clear()
 
     def __bool__(self) -> bool:
-        return bool(self.records or self._settlers or self._caches)
+        return bool(self.records or self.settlers or self._caches)
 
     def changed(self) -> str | None:
         """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
         for record in self.records:
             if record.differs():
                 return record.changed_name() if isinstance(record, _Bindings) else record.name
-        return next((check.name for check in self._caches if check.is_changed()), None)
+        for name, _, values in self._caches:
+            for value in values:
+                if value.changed() is not None:
+                    return name
+        return None
 
     def settle(self) -> None:
-        """Put back what a call may change without a failure."""
-        for settle in self._settlers:
+        """Put back or forget what a call may change without a failure."""
+        for settle in self.settlers:
             settle()
-
-    def must_be_emptied(self) -> bool:
-        """Whether a cache has values that are not compared, or too many."""
-        return any(check.must_be_emptied() for check in self._caches)
+        for _, _, values in self._caches:
+            for value in values:
+                value.settle()
 
     def restored(self) -> bool:
         """Put everything back, and return whether that was possible."""
         self.restore()
-        # Also those whose values are the same: a call that is answered from a cache would not change them again.
-        for check in self._caches:
-            check.clear()
+        # Also values that have not changed: they may be computed from what has, and a call that is answered from a
+        # cache would not make the same change again.
+        for _, cached, values in self._caches:
+            cached.cache_clear()
+            values.clear()
         return self.changed() is None
 
     def look_at(self, name: str, value: Any) -> Found:
@@ -152,40 +148,46 @@ class CodeSnapshot(Snapshot):
         return self._look_at_object(name, value)
 
     def _look_at_object(self, name: str, value: Any) -> Found:
-        kind = type(value)
-        if is_own(str(kind.__module__)):
+        kind, attributes = type(value), getattr(value, "__dict__", None)
+        if kind is dict:
+            _check_caches(value)
+        elif is_own(str(kind.__module__)):
             yield kind.__name__, kind
+            if type(attributes) is dict:
+                _check_caches(attributes)
             lazy = cached_properties(kind)
             if lazy:
-                self._settlers.append(functools.partial(_forget, value, lazy))
-        elif not is_array(value) and type(getattr(value, "__dict__", None)) is dict:
+                self.settlers.append(functools.partial(_forget, value, lazy))
+        elif not is_array(value) and type(attributes) is dict:
             # A library's own code may not take read-only arrays.
-            self._compared.update((id(part), part) for part in vars(value).values() if is_array(part))
+            self._compared.update((id(part), part) for part in attributes.values() if is_array(part))
         yield from super().look_at(name, value)
 
     def look_at_array(self, name: str, value: Any) -> Found:
         """Lock an array, instead of making a copy of it to compare with."""
-        self.arrays[id(value)] = value
         if self._lock and id(value) not in self._compared:
             value.setflags(write=False)
-            self._possible.append((_UNLOCKS, functools.partial(array_record, name, value)))
+            self._compare(_UNLOCKS, functools.partial(array_record, name, value))
+        else:
+            self._compared[id(value)] = value
         return super().look_at_array(name, value)
 
     def _look_at_function(self, function: types.FunctionType) -> Found:
-        known = function.__globals__
+        known, code = function.__globals__, function.__code__
         if not is_own(str(known.get("__name__"))):
             yield from _wrapped_by(function)
             return
-        self._may_bind(_BINDS, "", known)
-        self._may_bind(_SETS, f"{function.__name__}.", function)
-        for name in self._read(function.__code__):
-            is_imported = f"IMPORT_NAME {name}" in self._instructions
+        _check_caches(known)
+        self._compare(_BINDS, functools.partial(_Bindings, "", known))
+        self._compare(_BINDS, functools.partial(_Bindings, f"{function.__name__}.", function))
+        for name in self._read(code):
+            is_imported = f"IMPORT_NAME {name}" in self._code
             yield name, known.get(name, sys.modules.get(name) if is_imported else None)
-        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-            binds = frozenset({f"STORE_DEREF {name}", f"DELETE_DEREF {name}"})
-            self._possible.append((binds, functools.partial(Record, name, cell, _read_cell, _write_cell)))
-            yield from ((name, value) for value in _read_cell(cell))
-        arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
+        for name, cell in _cells(function):
+            cell.cell_contents = _checked(cell.cell_contents)
+            self._compare(_BINDS, functools.partial(Record, name, cell, _read_cell, _write_cell))
+            yield name, cell.cell_contents
+        arguments = code.co_varnames[: code.co_argcount]
         defaults = function.__defaults__ or ()
         yield from zip(arguments[len(arguments) - len(defaults) :], defaults, strict=True)
         yield from (function.__kwdefaults__ or {}).items()
@@ -193,27 +195,32 @@ class CodeSnapshot(Snapshot):
         yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
 
     def _read(self, code: types.CodeType) -> dict[str, None]:
-        """Note the instructions of some code, and return the names that it reads."""
+        """Note the names and instructions of some code, and return the names that it reads."""
         names = dict.fromkeys(code.co_names)
         for instruction in dis.get_instructions(code):
-            if instruction.opname.startswith(("STORE_", "DELETE_", "IMPORT_NAME")):
-                self._instructions |= {instruction.opname, f"{instruction.opname} {instruction.argval}"}
+            operation, name = instruction.opname, instruction.argval
+            if operation.startswith(("STORE_", "DELETE_", "IMPORT_NAME")):
+                is_free = operation.endswith("_DEREF") and name in code.co_freevars
+                self._code |= {operation, f"{operation} {name}", *(["nonlocal"] if is_free else [])}
         for constant in code.co_consts:
             if isinstance(constant, types.CodeType):
                 names |= self._read(constant)
-        self._instructions.update(names)
+        self._code.update(names)
         return names
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):
-            self._may_bind(_SETS, f"{kind.__name__}.", kind)
-            yield from ((f"{kind.__name__}.{name}", value) for name, value in _bound(kind).items())
+            yield from self._look_at_names(f"{kind.__name__}.", kind)
             yield from ((base.__name__, base) for base in kind.__bases__)
 
     def _look_at_module(self, module: types.ModuleType) -> Found:
         if is_own(module.__name__):
-            self._may_bind(_SETS, f"{module.__name__}.", vars(module))
-            yield from ((name, value) for name, value in vars(module).items() if name not in _OF_PYTHON)
+            yield from self._look_at_names(f"{module.__name__}.", vars(module))
+
+    def _look_at_names(self, prefix: str, owner: Any) -> Found:
+        _check_caches(owner)
+        self._compare(_BINDS, functools.partial(_Bindings, prefix, owner))
+        yield from ((f"{prefix}{name}", value) for name, value in _bound(owner).items() if name not in _OF_PYTHON)
 
     def _look_at_node(self, name: str, node: Node) -> Found:
         """Look into a node of a nested graph; what EPypes itself has in it is no state of the user's."""
@@ -223,21 +230,23 @@ class CodeSnapshot(Snapshot):
         yield name, node.func
         yield type(node).__name__, type(node)
         if type(node) is not Node:
-            # A component may count its calls. It is put back without a failure: no answer depends on it.
-            self._settlers.append(_Bindings(f"{name}.", node).settle)
+            record = _Bindings(f"{name}.", node)
+            self._possible.append((_BINDS, lambda: self.settlers.append(record.restore)))
             yield from ((f"{name}.{key}", value) for key, value in _bound(node).items())
 
     def _look_at_cache(self, name: str, cached: Any) -> Found:
-        """Look into the function behind an lru_cache."""
+        """Have the values of an lru_cache compared, and look into the function behind it."""
         if is_own(str(cached.__module__)):
-            if self._lock:
-                self._caches.append(getattr(cached, _CHECK, None) or _CacheCheck(name, cached, is_complete=False))
+            values = vars(cached).get(_VALUES)
+            if values is None:
+                self.settlers.append(cached.cache_clear)
             else:
-                yield from ((name, value) for value in cached_values(cached))
+                self._caches.append((name, cached, values))
         yield name, cached.__wrapped__
 
-    def _may_bind(self, needed: frozenset[str], name: str, value: Any) -> None:
-        self._possible.append((needed, functools.partial(_Bindings, name, value)))
+    def _compare(self, needed: frozenset[str], make: Callable[[], Record]) -> None:
+        """Compare an object if the code has one of the names or instructions."""
+        self._possible.append((needed, lambda: self.records.append(make())))
 
 
 def _forget(value: Any, lazy: frozenset[str]) -> None:
@@ -251,7 +260,7 @@ def _wrapped_by(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
     registry = function.__dict__.get("registry")
     held = [function.__dict__.get("__wrapped__")]
     held += registry.values() if isinstance(registry, types.MappingProxyType) else []
-    held += [value for cell in function.__closure__ or () for value in _read_cell(cell)]
+    held += [cell.cell_contents for _, cell in _cells(function)]
     yield from ((function.__name__, value) for value in held if callable(value) and not isinstance(value, type))
 
 
@@ -275,11 +284,6 @@ class _Bindings(Record):
     def changed_name(self) -> str:
         """Return what has another value."""
         return f"{self.name}{self._others(self.read(self.value))[0]}"
-
-    def settle(self) -> None:
-        """Put back what is bound otherwise."""
-        if self.differs():
-            self.restore()
 
     def _others(self, now: tuple[Any, ...]) -> list[str]:
         before, after = as_dict(self.saved), as_dict(now)
@@ -322,110 +326,62 @@ def _write_bindings(value: Any, saved: tuple[Any, ...]) -> None:
             bind(value, name, part)
 
 
+def _cells(function: types.FunctionType) -> list[tuple[str, types.CellType]]:
+    """Return the variables of a closure that have a value, by name."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    return [(name, cell) for name, cell in cells if cell != types.CellType()]
+
+
 def _read_cell(cell: types.CellType) -> tuple[Any, ...]:
-    return () if cell == types.CellType() else (cell.cell_contents,)
+    return (cell.cell_contents,)
 
 
 def _write_cell(cell: types.CellType, saved: tuple[Any, ...]) -> None:
-    if saved:
-        cell.cell_contents = saved[0]
-    else:
-        del cell.cell_contents
+    (cell.cell_contents,) = saved
 
 
 # -- caches --------------------------------------------------------------------------------------------------------
 
 
-class _CacheCheck:
-    """What the values of an lru_cache were when they were computed.
-
-    Parameters
-    ----------
-    name
-        What the code calls the cache.
-    cached
-        The cache.
-    is_complete
-        Whether each value was added here; else no mutable one may stay in it after a call.
-    """
-
-    def __init__(self, name: str, cached: Any, *, is_complete: bool) -> None:
-        self.name, self._cached, self._is_complete = name, cached, is_complete
-        self._misses = 0
-        self._snapshots: list[CodeSnapshot] = []
-
-    def add(self, value: Any) -> None:
-        """Lock the arrays in a value that was computed, and note what else can change in it."""
-        snapshot = CodeSnapshot({self.name: value})
-        if snapshot:
-            self._snapshots.append(snapshot)
-
-    def is_changed(self) -> bool:
-        """Whether a value is not what it was."""
-        return any(snapshot.changed() is not None for snapshot in self._snapshots)
-
-    def must_be_emptied(self) -> bool:
-        """Whether there are values that are not compared, or too many."""
-        if self._is_complete:
-            return len(self._snapshots) > _MOST_CHECKED
-        misses = self._cached.cache_info().misses
-        if misses != self._misses and CodeSnapshot({self.name: (*cached_values(self._cached),)}, lock=False):
-            return True
-        self._misses = misses
-        return False
-
-    def clear(self) -> None:
-        """Empty the cache."""
-        self._cached.cache_clear()
-        self._snapshots.clear()
-        self._misses = 0
+def _check_caches(owner: Any) -> None:
+    """Replace each lru_cache among the values of a dict or the attributes of a class by one that is compared."""
+    names = owner if type(owner) is dict else vars(owner)
+    for name, part in [*names.items()]:
+        checked = _checked(part)
+        if checked is not part and isinstance(owner, type):
+            type.__setattr__(owner, name, checked)
+        elif checked is not part:
+            names[name] = checked
 
 
-def check_caches(names: dict[str, Any]) -> None:
-    """Have each lru_cache of a module note what its function returns."""
-    made: dict[int, tuple[Any, Any]] = {}
-    for name, cached, put in _caches_of(names):
-        if id(cached) not in made:
-            made[id(cached)] = cached, _checked(name, cached)
-        put(made[id(cached)][1])
-
-
-def _caches_of(names: dict[str, Any]) -> Iterator[tuple[str, Any, Callable[[Any], object]]]:
-    """Give the caches among the names of a module, in its dicts, classes and closures, and what replaces each."""
-    for value in [names, *names.values()]:
-        found: list[tuple[str, Any, Callable[[Any], object]]] = []
-        if type(value) is dict:
-            found = [(str(key), part, functools.partial(value.__setitem__, key)) for key, part in value.items()]
-        elif not is_own(str(getattr(value, "__module__", ""))):
-            continue
-        elif isinstance(value, type):
-            put = functools.partial(type.__setattr__, value)
-            found = [
-                (f"{value.__name__}.{name}", part, functools.partial(put, name)) for name, part in vars(value).items()
-            ]
-        elif isinstance(value, types.FunctionType):
-            cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
-            found = [
-                (name, part, functools.partial(setattr, cell, "cell_contents"))
-                for name, cell in cells
-                for part in _read_cell(cell)
-            ]
-        yield from (each for each in found if type(each[1]) is _CACHED and is_own(str(each[1].__module__)))
-
-
-def _checked(name: str, cached: Any) -> Any:
-    """Return a new cache of the same function, whose values are compared."""
+def _checked(cached: Any) -> Any:
+    """Return a cache of the same function whose values are compared; what is no lru_cache of the user's as it is."""
+    if type(cached) in (staticmethod, classmethod):
+        checked = _checked(cached.__func__)
+        return cached if checked is cached.__func__ else type(cached)(checked)
+    if type(cached) is not _CACHED or not is_own(str(cached.__module__)):
+        return cached
+    if _CHECKED in vars(cached):
+        return vars(cached)[_CHECKED]
     function = cached.__wrapped__
+    values: list[CodeSnapshot] = []
 
     def compute(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        check.add(result)
+        snapshot = CodeSnapshot({"": result}, {})  # locks its arrays
+        if snapshot:
+            if len(values) >= _MOST_VALUES:
+                made.cache_clear()
+                # Other threads may put the last values into the cache only now.
+                del values[: _MOST_VALUES // 2]
+            values.append(snapshot)
         return result
 
-    again = functools.update_wrapper(functools.lru_cache(**cached.cache_parameters())(compute), function)
-    check = _CacheCheck(name, again, is_complete=True)
-    setattr(again, _CHECK, check)
-    return again
+    made: Any = functools.lru_cache(**cached.cache_parameters())(compute)
+    functools.update_wrapper(made, function)
+    vars(made)[_VALUES] = values
+    vars(cached)[_CHECKED] = vars(made)[_CHECKED] = made
+    return made
 
 
 # -- calls ---------------------------------------------------------------------------------------------------------
@@ -449,7 +405,7 @@ class MutableState:
         for name, function in _with_inner(functions):
             if is_unguarded(function):
                 # It rejects read-only arrays.
-                self._compared |= CodeSnapshot({name: function}, lock=False).arrays
+                CodeSnapshot({name: function}, self._compared, lock=False)
 
     def guarded(self, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
         """Have runners and nodes call what compares the state of these functions; return them, odd kinds wrapped.
@@ -464,7 +420,8 @@ class MutableState:
         if isinstance(function, Pipeline):
             self.guarded(function.network.nodes)
             return function
-        snapshot = CodeSnapshot({name: function}, compared=self._compared)
+        function = _checked(function)
+        snapshot = CodeSnapshot({name: function}, self._compared)
         if not snapshot:
             return function
         if type(function) in (types.FunctionType, functools.partial, _CACHED):
@@ -496,23 +453,24 @@ class MutableState:
         def call(*args: Any, **kwargs: Any) -> Any:
             if _under_way.get() is turns:
                 return function(*args, **kwargs)
-            entered, is_restored = turns.enter(), True
-            result, error = attempt(args, kwargs)
-            changed = snapshot.changed()
-            must_restore = changed is not None or snapshot.must_be_emptied()
-            with turns.changed:
-                try:
-                    is_alone = turns.was_alone(entered)
-                    if must_restore and is_alone:
-                        is_restored = snapshot.restored()
-                finally:
-                    turns.leave()
-            if must_restore and not is_alone:
-                with turns.alone():
-                    snapshot.restored()
-                    result, error = attempt(args, kwargs)
-                    changed = snapshot.changed()
+            number, is_alone, is_restored = turns.share(), bool(snapshot.settlers), True
+            try:
+                if is_alone:
+                    turns.claim(number)
+                    if snapshot.changed() is not None:  # by a call that waits to put it back
+                        snapshot.restored()
+                result, error = attempt(args, kwargs)
+                changed = snapshot.changed()
+                if changed is not None and not is_alone:
+                    is_alone = True
+                    if not turns.claim(number):
+                        snapshot.restored()
+                        result, error = attempt(args, kwargs)
+                        changed = snapshot.changed()
+                if changed is not None:
                     is_restored = snapshot.restored()
+            finally:
+                turns.leave(is_alone)
             try:
                 if error is not None:
                     raise error
@@ -529,47 +487,44 @@ class MutableState:
 
 
 class _Turns:
-    """The calls under way: each learns whether others ran meanwhile, and may run alone."""
+    """The calls under way: they share the objects, until one claims to have them alone."""
 
     def __init__(self) -> None:
-        self.changed = threading.Condition()
-        self._running = self._entered = 0
-        self._is_taken = False
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        # Calls under way but for those that wait; calls that claim to be alone; calls begun so far.
+        self._running = self._claims = self._begun = 0
 
-    def enter(self) -> int:
+    def share(self) -> int:
         """Begin a call; return its number, or 0 if others are running."""
-        with self.changed:
-            while self._is_taken:
-                self.changed.wait()
+        with self._lock:
+            while self._claims:
+                self._changed.wait()
             self._running += 1
-            self._entered += 1
-            return self._entered if self._running == 1 else 0
+            self._begun += 1
+            return self._begun if self._running == 1 else 0
 
-    def was_alone(self, entered: int) -> bool:
-        """Whether no other call ran since this one has begun; to be asked with ``changed`` held."""
-        return entered == self._entered
+    def claim(self, number: int) -> bool:
+        """Wait for the others to end or to wait, and let none begin; return whether there was none since ``number``."""
+        with self._lock:
+            was_alone = number == self._begun
+            self._claims += 1
+            self._running -= 1
+            self._changed.notify_all()
+            try:
+                while self._running:
+                    self._changed.wait()
+            finally:
+                self._running += 1
+            return was_alone
 
-    def leave(self) -> None:
-        """End a call, with ``changed`` held."""
-        self._running -= 1
-        if self._is_taken:
-            self.changed.notify_all()
-
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Wait for the others to end, and let none begin until the block ends."""
-        with self.changed:
-            while self._is_taken:
-                self.changed.wait()
-            self._is_taken = True
-            while self._running:
-                self.changed.wait()
-        try:
-            yield
-        finally:
-            with self.changed:
-                self._is_taken = False
-                self.changed.notify_all()
+    def leave(self, is_alone: bool) -> None:
+        """End a call."""
+        with self._lock:
+            self._running -= 1
+            if self._claims:
+                self._changed.notify_all()
+            self._claims -= is_alone
 
 
 def _with_inner(functions: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -13,7 +13,7 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -29,33 +29,38 @@ from epypes.run.guard import is_plain_array
 
 # What a person still reads, and a line of a diff still shows.
 MOST_NUMBERS: Final = 400
-ARRAYS_OF_HYPERPARAMETERS: Final = "hyperparameters"
+FORMAT: Final = 1
+_ARRAYS: Final = "hyperparameters"
 _KIND: Final = "kind"
 _SMALL: Final = range(-(2**63), 2**63)
-FORMAT: Final = 1
 _LINE: Final = 100
 _COMMENT: Final = (
     "What the graph in pipeline.py is run with. The manifest covers it: change a value in the notebook and promote."
 )
+_UNWRITABLE: Final = (
+    "is {}, which pipeline.toml can't hold. Use numbers, strings, a small array or tuples, lists and dicts of them; "
+    "make it in a function"
+)
+_TOO_LARGE: Final = (
+    f"is or holds {{}}; {MOST_NUMBERS} are the most that pipeline.toml holds, where people read them. Make each array "
+    "a hyperparameter of its own, or let the function read it from a variable of the notebook, outside of it: the "
+    "bundle has either as a file. Or make it in a function"
+)
+# What stands before the lines that need a word.
+_COMMENTS: Final = {
+    "types": "The annotations of the functions are not compared.",
+    "inputs": "The tokens that an event brings, and those that its answer carries.",
+    "rgb": "Their three or four channels are RGB; those of all others are BGR.",
+    "own": "What pipeline.py has of its own, in place of what a bundle usually does.",
+}
 
 
 class Unwritable(ValueError):
-    """A value that no entry holds to the last bit; its text says of which kind it is."""
+    """A value that no entry holds to the last bit; its text says of which kind it is, ``reason`` what to do instead."""
 
-    reason = (
-        "is {}, which pipeline.toml can't hold. Use numbers, strings, a small array or tuples, lists and dicts of "
-        "them; make it in a function"
-    )
-
-
-class LargeArray(Unwritable):
-    """An array of numbers that is too large for text."""
-
-    reason = (
-        f"is or holds {{}}; {MOST_NUMBERS} are the most that pipeline.toml holds, where people read them. Make each "
-        "array a hyperparameter of its own, or let the function read it from a variable of the notebook, outside of "
-        "it: the bundle has either as a file. Or make it in a function"
-    )
+    def __init__(self, kind: str, reason: str = _UNWRITABLE) -> None:
+        super().__init__(kind)
+        self.reason = reason.format(kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +120,8 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
     for token, value in values.items():
         try:
             written(value)
-        except Unwritable as found:
-            reasons.append(f"{what} {token!r} {found.reason.format(found)}; or {last}.")
+        except Unwritable as error:
+            reasons.append(f"{what} {token!r} {error.reason}; or {last}.")
     return reasons
 
 
@@ -130,109 +135,81 @@ def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict
 
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     """Write pipeline.toml, with a comment per section and the ranges that annotations and usual names give."""
-    tomlkit = _tomlkit()
+    with optional_import():
+        import tomlkit
+    bundle: dict[str, Any] = {"format": FORMAT, "name": settings.name}
+    bundle |= {} if settings.types else {"types": False}
+    bundle |= {"groups": True} if settings.has_groups else {}
+    ports = {"inputs": list(settings.inputs), "outputs": list(settings.outputs)}
+    ports |= {key: list(getattr(settings, key)) for key in ("rgb", "own") if getattr(settings, key)}
     document = tomlkit.document()
     document.add(tomlkit.comment(_COMMENT))
-    bundle = tomlkit.table()
-    bundle.add("format", FORMAT)
-    bundle.add("name", settings.name)
-    if not settings.types:
-        bundle.add(tomlkit.comment("The annotations of the functions are not compared."))
-        bundle.add("types", False)
-    if settings.has_groups:
-        bundle.add("groups", True)
-    document.add("bundle", bundle)
-    document.add("ports", _ports(settings))
-    hyperparameters = tomlkit.table(is_super_table=True)
-    for token, value in settings.hyperparameters.items():
-        hyperparameters.add(token, _table(entry_of(cg, token, value), _takers(cg, token)))
-    document.add("hyperparameters", hyperparameters)
-    for section, values in (("defaults", settings.defaults), ("attributes", settings.attributes)):
-        if values:
-            table = tomlkit.table(is_super_table=True)
-            for name, value in values.items():
-                table.add(name, _table(written(value)))
-            document.add(section, table)
+    document.add("bundle", _table(bundle))
+    document.add("ports", _table(ports))
+    for section in ("hyperparameters", "defaults", "attributes"):
+        tables = tomlkit.table(is_super_table=True)
+        for name, value in getattr(settings, section).items():
+            if section == "hyperparameters":
+                takers = ", ".join(cg.digraph.consumers.get(name, ()))
+                tables.add(name, _table(_entry_of(cg, name, value), f"Taken by {takers}."))
+            else:
+                tables.add(name, _table(written(value)))
+        if tables:
+            document.add(section, tables)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
-def _tomlkit() -> Any:
+def _table(entries: Mapping[str, Any], comment: str = "") -> Any:
+    """Return a table for TOML: rows of a matrix, and what is long, on lines of their own."""
     with optional_import():
         import tomlkit
+    table = tomlkit.table()
+    if comment and comment.isprintable():
+        table.add(tomlkit.comment(comment))
+    for key, part in entries.items():
+        item = part
+        if key in _COMMENTS:
+            table.add(tomlkit.comment(_COMMENTS[key]))
+        if isinstance(part, dict):
+            item = tomlkit.inline_table()
+            item.update(part)
+        elif isinstance(part, list):
+            item = tomlkit.array()
+            item.extend(part)
+            has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
+            item.multiline(has_rows or len(item.as_string()) > _LINE)
+        table.add(key, item)
+    return table
 
-    return tomlkit
 
-
-def _ports(settings: Settings) -> Any:
-    tomlkit = _tomlkit()
-    ports = tomlkit.table()
-    ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
-    ports.add("inputs", list(settings.inputs))
-    ports.add("outputs", list(settings.outputs))
-    if settings.rgb:
-        ports.add(tomlkit.comment("Their three or four channels are RGB; those of all others are BGR."))
-        ports.add("rgb", list(settings.rgb))
-    if settings.own:
-        ports.add(tomlkit.comment("What pipeline.py has of its own, in place of what a bundle usually does."))
-        ports.add("own", list(settings.own))
-    return ports
-
-
-def entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
+def _entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
     """Return what stands in pipeline.toml of a hyperparameter: its value, and the range that it may take."""
     entry = written(value)
     hint = range_of(cg, token, value)
     if not isinstance(hint, Param):
         return entry
-    limits = {key: getattr(hint, key) for key in ("low", "high", "step")}
-    entry.update({key: plain(limit) for key, limit in limits.items() if limit is not None and _is_finite(limit)})
+    entry.update({key: plain(getattr(hint, key)) for key in ("low", "high", "step") if _is_limit(getattr(hint, key))})
     entry.update({key: True for key in ("odd", "log") if getattr(hint, key)})
-    if hint.soft is not None and all(map(_is_finite, hint.soft)):
+    if hint.soft is not None and all(map(_is_limit, hint.soft)):
         entry["soft"] = [plain(end) for end in hint.soft]
     if hint.choices and all(map(fits, hint.choices)):
-        entry["choices"] = [_choice(choice, value) for choice in hint.choices]
+        entry["choices"] = [_choice(choice, entry) for choice in hint.choices]
         entry.update({"labels": list(hint.labels)} if hint.labels else {})
     entry.update({key: getattr(hint, key) for key in ("unit", "about") if getattr(hint, key)})
     return entry
 
 
-def _is_finite(limit: Any) -> bool:
-    return math.isfinite(limit) and fits(plain(limit)) and "kind" not in written(plain(limit))
+def _is_limit(limit: Any) -> bool:
+    """Whether TOML has a limit as a number; it may have no infinite one."""
+    number = plain(limit)
+    return type(number) in (int, float) and math.isfinite(number) and _KIND not in written(number)
 
 
-def _choice(choice: Any, value: Any) -> Any:
-    """Return a choice as the value would be written in its place."""
-    entry = written(choice)
-    same = "kind" not in entry or ("value" in entry and {**entry, "value": 0} == {**written(value), "value": 0})
-    return entry["value"] if same else entry
-
-
-def _takers(cg: CompGraph, token: str) -> str:
-    takers = cg.digraph.consumers.get(token, ())
-    return f"Taken by {', '.join(takers)}."
-
-
-def _table(entry: Mapping[str, Any], comment: str = "") -> Any:
-    table = _tomlkit().table()
-    if comment and comment.isprintable():
-        table.add(_tomlkit().comment(comment))
-    for key, part in entry.items():
-        table.add(key, _item(part))
-    return table
-
-
-def _item(part: Any) -> Any:
-    """Return a value for TOML: rows of a matrix, and what is long, on lines of their own."""
-    if isinstance(part, dict):
-        table = _tomlkit().inline_table()
-        table.update(part)
-        return table
-    if not isinstance(part, list):
-        return part
-    item = _tomlkit().array()
-    item.extend(part)
-    has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
-    return item.multiline(True) if has_rows or len(item.as_string()) > _LINE else item
+def _choice(choice: Any, entry: Mapping[str, Any]) -> Any:
+    """Return a choice as it stands in the place of an entry's value; whole if it is of another kind."""
+    own = written(choice)
+    same = all(own.get(key) == entry.get(key) for key in (_KIND, "dtype", "shape", "enum"))
+    return own["value"] if (same or _KIND not in own) and "value" in own else own
 
 
 def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Settings:
@@ -317,7 +294,7 @@ def store_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, A
     after, arrays = dict(values), {}
     for token, value in values.items():
         if is_plain_array(value) and value.dtype.kind in "biufc" and value.size > MOST_NUMBERS:
-            file = f"{ARRAYS_OF_HYPERPARAMETERS}/{re.sub(r'[^0-9A-Za-z_]', '_', token)}.npy"
+            file = f"{_ARRAYS}/{re.sub(r'[^0-9A-Za-z_]', '_', token)}.npy"
             while file in arrays:
                 file = f"{file.removesuffix('.npy')}_.npy"
             after[token], arrays[file] = StoredArray(file), value
@@ -364,11 +341,7 @@ def alike(entry: Mapping[str, Any], value: Any) -> Any:
 
 def fits(value: Any) -> bool:
     """Whether an entry holds a value to the last bit."""
-    try:
-        written(value)
-    except Unwritable:
-        return False
-    return True
+    return not unwritable({"": value})
 
 
 def written(value: Any) -> dict[str, Any]:
@@ -386,20 +359,69 @@ def written(value: Any) -> dict[str, Any]:
 
 
 def _written(value: Any) -> dict[str, Any]:
-    write = _WRITERS.get(type(value))
-    if write is not None:
-        return write(value)
+    kind = type(value)
+    if value is None:
+        return {_KIND: "none"}
+    if kind in (bool, float) or (kind is int and value in _SMALL):
+        return {"value": value}
+    if kind is str:
+        if any("\ud800" <= character <= "\udfff" for character in value):
+            raise Unwritable("a text with half a character in it")
+        return {"value": value}
+    if kind is list:
+        return {"value": _items(value)}
+    if kind is dict and _KIND not in value and all(type(key) is str and fits(key) for key in value):
+        return {"value": {key: _part(item) for key, item in value.items()}}
+    for name, (python_type, write, _) in _KINDS.items():
+        if kind is python_type:
+            return {"value": write(value), _KIND: name}
+    return _written_by_name(value)
+
+
+def _written_by_name(value: Any) -> dict[str, Any]:
+    """Return the entry of a value that names its dtype, its enumeration or its file."""
+    numpy = sys.modules.get("numpy")
     if is_plain_array(value):
         return _array(value)
-    if _is_numpy_number(value):
+    if numpy and isinstance(value, numpy.number | numpy.bool_) and _is_exact(value.dtype):
         return {"value": _of_number(value), _KIND: "numpy", "dtype": value.dtype.name}
     if isinstance(value, enum.Enum) and value.name in type(value).__members__:
         return {"value": value.name, _KIND: "enum", "enum": type(value).__qualname__}
-    if isinstance(value, StoredArray):
-        return {"value": value.file, _KIND: "file"}
     if isinstance(value, Member):
         return {"value": value.name, _KIND: "enum", "enum": value.enum}
+    if isinstance(value, StoredArray):
+        return {"value": value.file, _KIND: "file"}
     raise Unwritable(f"a {type(value).__name__}")
+
+
+def _is_exact(dtype: Any) -> bool:
+    """Whether Python's own numbers hold those of a dtype to the last bit."""
+    return dtype.kind in "biuf" and dtype.itemsize <= 8
+
+
+def _array(array: Any) -> dict[str, Any]:
+    if not _is_exact(array.dtype):
+        raise Unwritable(f"an array of {array.dtype}")
+    if array.size > MOST_NUMBERS:
+        raise Unwritable(f"an array of {array.size} numbers", _TOO_LARGE)
+    import numpy as np
+
+    numbers = np.array([_of_number(number) for number in array.flat], object)
+    dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
+    entry = {"value": numbers.reshape(array.shape).tolist(), _KIND: "array", "dtype": dtype}
+    entry |= {} if array.size else {"shape": list(array.shape)}
+    if read(entry).tobytes() != array.tobytes():
+        raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
+    return entry
+
+
+def _of_number(number: Any) -> Any:
+    """Return a number of NumPy's as the shortest one of Python's that makes it again."""
+    whole = number.item()
+    if number.dtype.kind != "f":
+        return _part(whole)
+    short = float(str(number))
+    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole)
 
 
 def _part(value: Any) -> Any:
@@ -408,12 +430,24 @@ def _part(value: Any) -> Any:
     return entry if _KIND in entry else entry["value"]
 
 
-def _whole(part: Any, enums: Mapping[str, Any]) -> Any:
-    if isinstance(part, dict):
-        if _KIND in part:
-            return read(part, enums)
-        return {key: _whole(item, enums) for key, item in part.items()}
-    return [_whole(item, enums) for item in part] if isinstance(part, list) else part
+def _items(values: Iterable[Any]) -> list[Any]:
+    return [_part(item) for item in values]
+
+
+def _sorted_items(values: Iterable[Any]) -> list[Any]:
+    return sorted(_items(values), key=repr)
+
+
+# The type of each kind, what stands in an entry for a value of it, and how that makes the value again.
+_KINDS: Final[Mapping[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]]] = {
+    "int": (int, hex, lambda text: int(text, 16)),
+    "complex": (complex, lambda value: _items((value.real, value.imag)), lambda parts: complex(*parts)),
+    "bytes": (bytes, bytes.hex, bytes.fromhex),
+    "tuple": (tuple, _items, tuple),
+    "set": (set, _sorted_items, set),
+    "frozenset": (frozenset, _sorted_items, frozenset),
+    "dict": (dict, lambda value: [_items(pair) for pair in value.items()], dict),
+}
 
 
 def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
@@ -438,13 +472,43 @@ def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> An
     TypeError
         It makes no sense.
     """
-    known = {} if enums is None else enums
     kind = entry.get(_KIND)
+    if kind == "none":
+        return None
+    value = _whole(entry["value"], enums)
     if kind is None:
-        return _whole(entry["value"], known)
-    if not isinstance(kind, str) or kind not in _READERS:
+        return value
+    if isinstance(kind, str) and kind in _KINDS:
+        return _KINDS[kind][2](value)
+    if kind in ("array", "numpy"):
+        return _of_numpy(kind, value, entry)
+    if kind == "enum":
+        name = entry["enum"]
+        return enums[name][value] if enums and name in enums else Member(name, value)
+    if kind != "file":
         raise TypeError(f"no value has the kind {kind!r}")
-    return _READERS[kind](entry, known)
+    if not isinstance(value, str) or not re.fullmatch(rf"{_ARRAYS}/\w+\.npy", value):
+        raise TypeError(f"{value!r} is no file of {_ARRAYS}/")
+    return StoredArray(value)
+
+
+def _of_numpy(kind: str, value: Any, entry: Mapping[str, Any]) -> Any:
+    import numpy as np
+
+    dtype = np.dtype(entry["dtype"])
+    if kind == "numpy":
+        return dtype.type(value)
+    array = np.array(value, dtype)
+    return array.reshape(entry["shape"]) if "shape" in entry else array
+
+
+def _whole(part: Any, enums: Mapping[str, Any] | None) -> Any:
+    """Return a value that stands inside a list or table."""
+    if isinstance(part, dict):
+        if _KIND in part:
+            return read(part, enums)
+        return {key: _whole(item, enums) for key, item in part.items()}
+    return [_whole(item, enums) for item in part] if isinstance(part, list) else part
 
 
 def members_in(value: Any) -> Iterator[enum.Enum | Member]:
@@ -457,126 +521,3 @@ def members_in(value: Any) -> Iterator[enum.Enum | Member]:
     elif type(value) in (tuple, list, set, frozenset):
         for item in value:
             yield from members_in(item)
-
-
-def _is_numpy_number(value: Any) -> bool:
-    """Whether this is a scalar of NumPy's that Python's own numbers hold to the last bit."""
-    numpy = sys.modules.get("numpy")
-    if numpy is None or not isinstance(value, numpy.number | numpy.bool_):
-        return False
-    return value.dtype.kind in "biuf" and value.dtype.itemsize <= 8
-
-
-def _of_number(number: Any) -> Any:
-    """Return a number of NumPy's as the shortest one of Python's that makes it again."""
-    whole = number.item()
-    if number.dtype.kind != "f":
-        return _part(whole)
-    short = float(str(number))
-    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole)
-
-
-def _as_it_is(value: Any) -> dict[str, Any]:
-    return {"value": value}
-
-
-def _text(value: str) -> dict[str, Any]:
-    if any("\ud800" <= character <= "\udfff" for character in value):
-        raise Unwritable("a text with half a character in it")
-    return {"value": value}
-
-
-def _integer(value: int) -> dict[str, Any]:
-    return {"value": value} if value in _SMALL else {"value": hex(value), _KIND: "int"}
-
-
-def _sequence(value: Any) -> dict[str, Any]:
-    items = [_part(item) for item in value]
-    return {"value": items} if type(value) is list else {"value": items, _KIND: type(value).__name__}
-
-
-def _set(value: Any) -> dict[str, Any]:
-    items = sorted((_part(item) for item in value), key=repr)
-    return {"value": items, _KIND: type(value).__name__}
-
-
-def _mapping(value: dict[Any, Any]) -> dict[str, Any]:
-    if _KIND not in value and all(type(key) is str and fits(key) for key in value):
-        return {"value": {key: _part(item) for key, item in value.items()}}
-    return {"value": [[_part(key), _part(item)] for key, item in value.items()], _KIND: "dict"}
-
-
-def _array(array: Any) -> dict[str, Any]:
-    import numpy as np
-
-    if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
-        raise Unwritable(f"an array of {array.dtype}")
-    if array.size > MOST_NUMBERS:
-        raise LargeArray(f"an array of {array.size} numbers")
-    dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
-    numbers = [_of_number(number) for number in array.astype(array.dtype.newbyteorder("=")).reshape(-1)]
-    value = np.array(numbers, object).reshape(array.shape).tolist()
-    entry = {"value": value, _KIND: "array", "dtype": dtype}
-    if array.size == 0:
-        entry["shape"] = list(array.shape)
-    if np.asarray(read(entry)).tobytes() != array.tobytes():
-        raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
-    return entry
-
-
-def _read_array(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
-    import numpy as np
-
-    dtype = np.dtype(entry["dtype"])
-    if "shape" in entry:
-        return np.zeros(entry["shape"], dtype)
-    return np.array(_whole(entry["value"], enums), dtype)
-
-
-def _read_number(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
-    import numpy as np
-
-    return np.dtype(entry["dtype"]).type(_whole(entry["value"], enums))
-
-
-def _read_member(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
-    name, member = entry["enum"], entry["value"]
-    return enums[name][member] if name in enums else Member(name, member)
-
-
-def _read_stored(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> StoredArray:
-    file = entry["value"]
-    if not isinstance(file, str) or not re.fullmatch(rf"{ARRAYS_OF_HYPERPARAMETERS}/\w+\.npy", file):
-        raise TypeError(f"{file!r} is no file of {ARRAYS_OF_HYPERPARAMETERS}/")
-    return StoredArray(file)
-
-
-_WRITERS: Final[Mapping[type, Callable[[Any], dict[str, Any]]]] = {
-    type(None): lambda value: {_KIND: "none"},
-    bool: _as_it_is,
-    int: _integer,
-    float: _as_it_is,
-    str: _text,
-    complex: lambda value: {"value": [_part(value.real), _part(value.imag)], _KIND: "complex"},
-    bytes: lambda value: {"value": value.hex(), _KIND: "bytes"},
-    tuple: _sequence,
-    list: _sequence,
-    set: _set,
-    frozenset: _set,
-    dict: _mapping,
-}
-
-_READERS: Final[Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Any]]] = {
-    "none": lambda entry, enums: None,
-    "int": lambda entry, enums: int(entry["value"], 16),
-    "complex": lambda entry, enums: complex(*_whole(entry["value"], enums)),
-    "bytes": lambda entry, enums: bytes.fromhex(entry["value"]),
-    "tuple": lambda entry, enums: tuple(_whole(entry["value"], enums)),
-    "set": lambda entry, enums: set(_whole(entry["value"], enums)),
-    "frozenset": lambda entry, enums: frozenset(_whole(entry["value"], enums)),
-    "dict": lambda entry, enums: {_whole(key, enums): _whole(item, enums) for key, item in entry["value"]},
-    "array": _read_array,
-    "file": _read_stored,
-    "numpy": _read_number,
-    "enum": _read_member,
-}

@@ -14,7 +14,7 @@ from epypes.bundle.draft import draft_folder, swap_folders
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest, digest
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
-from epypes.bundle.settings import alike, fits, read, written
+from epypes.bundle.settings import Unwritable, alike, read, written
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
 
@@ -75,8 +75,9 @@ def write_back(
             shutil.copytree(folder, draft, ignore=shutil.ignore_patterns("__pycache__"))
             (draft / SETTINGS).write_text(changed, encoding="utf-8")
             _record(draft, folder, timeout_s)
-            written_text = (draft / SETTINGS).read_text(encoding="utf-8")
-            found = WriteBack(_diff(text, written_text), digest(draft))
+            old, new = (part.splitlines(True) for part in (text, (draft / SETTINGS).read_text(encoding="utf-8")))
+            diff = "".join(difflib.unified_diff(old, new, f"a/{SETTINGS}", f"b/{SETTINGS}"))
+            found = WriteBack(diff, digest(draft))
             if check_manifest(folder) != before:
                 raise BundleError(folder, f"{folder} was replaced meanwhile. Write the values back again.")
             if not dry_run:
@@ -104,27 +105,22 @@ def changed_settings(text: str, values: Mapping[str, Any]) -> str:
     for token, value in values.items():
         if token not in entries:
             raise UnknownName("hyperparameter", token, entries, "in this bundle")
-        if not fits(alike(entries[token], value)):
+        entry = entries[token]
+        try:
+            new = written(alike(entry, value))
+        except Unwritable as error:
             kind = type(value).__name__
-            raise HyperparameterError(token, f"Hyperparameter {token!r} can't be a {kind}: {SETTINGS} can't hold one.")
-        _change(entries[token], written(alike(entries[token], value)))
+            text = f"Hyperparameter {token!r} can't be a {kind}: {SETTINGS} can't hold one."
+            raise HyperparameterError(token, text) from error
+        # Its range stays.
+        old = written(read(entry.unwrap()))
+        for key in old.keys() - new.keys():
+            del entry[key]
+        for key, part in new.items():
+            # 1, 1.0 and true are equal, but not the same.
+            if key not in old or repr(old[key]) != repr(part):
+                entry[key] = part
     return tomlkit.dumps(document)
-
-
-def _change(entry: Any, new: Mapping[str, Any]) -> None:
-    """Change what an entry says of its value, and leave its range alone."""
-    old = written(read(entry.unwrap()))
-    for key in old.keys() - new.keys():
-        del entry[key]
-    for key, part in new.items():
-        # 1, 1.0 and true are equal, but not the same.
-        if key not in old or repr(old[key]) != repr(part):
-            entry[key] = part
-
-
-def _diff(before: str, after: str) -> str:
-    left, right = (text.splitlines(keepends=True) for text in (before, after))
-    return "".join(difflib.unified_diff(left, right, f"a/{SETTINGS}", f"b/{SETTINGS}"))
 
 
 def _record(draft: Path, target: Path, timeout_s: float) -> None:
