@@ -301,15 +301,6 @@ def store_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, A
     return after, arrays
 
 
-def write_stored_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
-    """Write the arrays into a bundle, to the last bit."""
-    for file, array in arrays.items():
-        import numpy as np
-
-        (folder / file).parent.mkdir(exist_ok=True)
-        np.save(folder / file, array, allow_pickle=False)
-
-
 def load_array(path: Path, mmap_mode: Literal["r"] | None = None) -> Any:
     """Return an array of a bundle, which can't be written to.
 
