@@ -15,8 +15,9 @@ closure holds it. What can't be compared is forgotten or put back after each cal
 property has computed, a cache that is held elsewhere, and the attributes of a node of the user's own class, which may
 count its calls. A function that reaches one of these never runs beside another one.
 
-What a pipeline of the user's own class has in its attributes is not looked at. The global generators of ``random`` and
-``numpy.random`` are not compared: a function may seed them for another one, and the replay finds draws without a seed.
+A background model or a filter of OpenCV that outlives the call counts as changed. What a pipeline of the user's own
+class has in its attributes is not looked at. The global generators of ``random`` and ``numpy.random`` are not compared:
+a function may seed them for another one, and the replay finds draws without a seed.
 
 Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.
@@ -62,6 +63,8 @@ _OF_PYTHON: Final = frozenset(
     | {"__annotations__", "__annotations_cache__", "__annotate__", "__annotate_func__", "__static_attributes__"}
     | {"_value2member_map_", "__slotnames__"}
 )
+# Objects of these classes of OpenCV remember what they are given, where Python can't see it.
+_MODELS_OF_CV2: Final = frozenset({"BackgroundSubtractor", "KalmanFilter", "Tracker", "VideoCapture", "VideoWriter"})
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
@@ -158,6 +161,8 @@ class CodeSnapshot(Snapshot):
             lazy = cached_properties(kind)
             if lazy:
                 self.settlers.append(functools.partial(_forget, value, lazy))
+        elif not _MODELS_OF_CV2.isdisjoint(base.__name__ for base in kind.__mro__ if base.__module__[:3] == "cv2"):
+            self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
             # A library's own code may not take read-only arrays.
             self._compared.update((id(part), part) for part in attributes.values() if is_array(part))
@@ -247,6 +252,11 @@ class CodeSnapshot(Snapshot):
     def _compare(self, needed: frozenset[str], make: Callable[[], Record]) -> None:
         """Compare an object if the code has one of the names or instructions."""
         self._possible.append((needed, lambda: self.records.append(make())))
+
+
+def _always_another(value: Any) -> tuple[object, ...]:
+    """Return contents that differ from those of any other call."""
+    return (object(),)
 
 
 def _forget(value: Any, lazy: frozenset[str]) -> None:

@@ -55,6 +55,10 @@ KEPT = {
     "both numbers of a pair that are drawn": (
         "R = np.random.RandomState(0)\ndef f(x):\n    return round(R.normal() if x > 100 else 0.0, 6)", "R",
     ),
+    "background model in a cache": (
+        "import cv2\n@functools.cache\ndef model():\n    return cv2.createBackgroundSubtractorMOG2()\n"
+        "def f(x):\n    return int(model().apply(np.full((9, 9), x, np.uint8)).sum()) if x > 100 else 0", "model",
+    ),
     "map": ("L = []\ndef f(x):\n    if x > 100: list(map(L.append, [x]))\n    return len(L)", "L"),
     "walrus": ("L = []\ndef f(x):\n    if x > 100: (l := L).append(x)\n    return len(L)", "L"),
     "with ... as": (
