@@ -33,6 +33,7 @@ from epypes.bundle.notebook_source import definition_of, lambdas_of, nested_code
 from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, meanings_of, without_nodes
 from epypes.bundle.resolve import layers
 from epypes.pipeline import Node
+from epypes.run import CompGraphRunner
 
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
@@ -150,15 +151,13 @@ class _Walk:
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
         try:
+            if isinstance(ours, types.ModuleType | CompGraphRunner):
+                raise TypeError("what a module holds, and a runner's last run, is no part of its description")
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
             text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."
             raise _Different(path, f"{text} Make it inside the function.") from error
-        if (
-            mine[:2] != others[:2]
-            or mine.kind == "module"
-            or (mine.kind == "array" and not _is_laid_out_as(ours, theirs))
-        ):
+        if mine[:2] != others[:2] or (mine.kind == "array" and not _is_laid_out_as(ours, theirs)):
             raise _unlike(path, ours, theirs)
         left_out: tuple[str, ...] = (ANNOTATION,)
         if isinstance(ours, types.FunctionType) and ours.__code__ is not theirs.__code__:

@@ -12,17 +12,15 @@ each, and then equal digests are no proof that nothing has changed.
 
 from __future__ import annotations
 
-import builtins
 import dis
-import functools
 import hashlib
 import importlib
 import importlib.util
 import re
 import sys
 import types
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path, PurePath
 from typing import Any, Final
@@ -37,36 +35,19 @@ from epypes.bundle.objects import (
     is_of_library,
     without_nodes,
 )
+from epypes.bundle.requirements import bringing
 
 _DIGEST_BYTES: Final = 16
 _OURS: Final = "epypes"
 # Builtins by which code reads what its names don't say.
-_BY_TEXT: Final = (eval, exec, globals, builtins.__import__)
+_BY_TEXT: Final = frozenset({"eval", "exec", "globals", "__import__"})
 _ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
 # Names by which code reads files or the environment: of Python, numpy, OpenCV, Pillow, pandas and scikit-image.
-_READERS: Final = frozenset(
-    [
-        "VideoCapture",
-        "environ",
-        "environb",
-        "fromfile",
-        "genfromtxt",
-        "getenv",
-        "getenvb",
-        "imread",
-        "imreadmulti",
-        "load",
-        "loadtxt",
-        "memmap",
-        "open",
-        "open_memmap",
-        "read_bytes",
-        "read_csv",
-        "read_parquet",
-        "read_text",
-        "urlopen",
-    ]
-)
+_READERS: Final = frozenset({
+    "VideoCapture", "environ", "environb", "fromfile", "genfromtxt", "getenv", "getenvb", "imread", "imreadmulti",
+    "load", "loadtxt", "memmap", "open", "open_memmap", "read_bytes", "read_csv", "read_parquet", "read_text",
+    "urlopen",
+})  # fmt: skip
 _LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset(
@@ -173,7 +154,8 @@ class Digester:
             return
         try:
             made = describe(value)
-            if made.is_pickled and self._of_data and not self._is_plain_data(value):
+            home = type(value).__module__
+            if self._of_data and made.is_pickled and is_installed(home) and home.partition(".")[0] not in _DATA_MODULES:
                 made = describe_message(value)
         except RecursionError:
             raise
@@ -182,45 +164,34 @@ class Digester:
             return
         if type(value) not in _IMMUTABLE and made.kind not in ("array", "installed"):
             self._numbers[id(value)] = len(self._numbers), value
-        with self._within(value, made.is_state):
-            if made.module:
-                self._met.add(made.module)
-            self._put(made.kind, *made.content)
-            parts = [(label, part) for label, part in made.parts if not label.startswith(CACHED)]
-            if isinstance(value, PurePath):
-                self._put(file_digest(Path(value)))
-            elif isinstance(value, types.FunctionType) and not is_of_library(value):
-                parts += self._read_elsewhere(value, dict(parts))
-            elif made.kind == "module" and value.__name__ == "__main__":
-                self._add_unknown(value)
-            self._put(str(len(parts)))
-            for label, part in parts:
-                self._put(label)
-                self._path.append(label)
-                self._add(part)
-                self._path.pop()
-
-    @contextmanager
-    def _within(self, value: Any, is_state: bool) -> Iterator[None]:
         before = self._into, self._met, self._of_data
-        if is_state:
+        if made.is_state:
             self._into, self._met = self.state, self.state_modules
         self._of_data = self._of_data and not isinstance(value, _CODE)
-        try:
-            yield
-        finally:
-            self._into, self._met, self._of_data = before
-
-    def _is_plain_data(self, value: Any) -> bool:
-        module = type(value).__module__
-        return not is_installed(module) or module.partition(".")[0] in _DATA_MODULES
+        if made.module:
+            self._met.add(made.module)
+        self._put(made.kind, *made.content)
+        parts = [(label, part) for label, part in made.parts if not label.startswith(CACHED)]
+        if isinstance(value, PurePath):
+            self._put(file_digest(Path(value)))
+        elif isinstance(value, types.FunctionType) and not is_of_library(value):
+            parts += self._read_elsewhere(value, dict(parts))
+        elif made.kind == "module" and value.__name__ == "__main__":
+            self._add_unknown(value)
+        self._put(str(len(parts)))
+        for label, part in parts:
+            self._put(label)
+            self._path.append(label)
+            self._add(part)
+            self._path.pop()
+        self._into, self._met, self._of_data = before
 
     def _read_elsewhere(self, function: types.FunctionType, parts: Mapping[str, Any]) -> list[tuple[str, Any]]:
         """Return what a function reads of the user's modules, by name; note what it reads by text or from files."""
         codes = [*nested_codes(function.__code__)]
         used = {name for code in codes for name in code.co_names}
         waiting = [(label.strip(" '"), value) for label, value in parts.items()]
-        by_text = next((name for name, value in waiting if any(value is one for one in _BY_TEXT)), "")
+        by_text = min(_BY_TEXT.intersection(dict(waiting)) - function.__globals__.keys(), default="")
         if by_text or "import_module" in used:
             self._add_unknown(function, f"a call of {by_text or 'import_module'!r}")
         for name in _imported_within(codes, function.__globals__.get("__package__") or ""):
@@ -259,16 +230,10 @@ def versions_of(modules: Iterable[str]) -> list[str]:
         if top == _OURS:
             found[top] = metadata.version(_OURS)
         elif is_installed(name) and top not in sys.stdlib_module_names:
-            found[top] = ", ".join(f"{one}=={metadata.version(one)}" for one in _distributions().get(top, ()))
+            found[top] = ", ".join(f"{one}=={metadata.version(one)}" for one in bringing(top))
         elif file := getattr(sys.modules.get(name), "__file__", None):
             found[name] = file_digest(Path(file))
     return sorted(f"{name} {version}" for name, version in found.items())
-
-
-@functools.cache
-def _distributions() -> Mapping[str, list[str]]:
-    # A distribution is listed once for each of its files' folders.
-    return {name: sorted(set(found)) for name, found in metadata.packages_distributions().items()}
 
 
 def _imported_within(codes: Iterable[types.CodeType], package: str) -> set[str]:

@@ -15,7 +15,6 @@ import copyreg
 import dataclasses
 import enum
 import functools
-import importlib.util
 import inspect
 import re
 import sys
@@ -25,17 +24,16 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from epypes.bundle.definitions import defaults_of
 from epypes.bundle.expressions import has_steady_order
 from epypes.bundle.notebook_source import names_from_outside, nested_codes
-from epypes.graph import CompGraph, Switch
+from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner
 from epypes.run.guard import as_written, is_plain_array, is_unguarded
-from epypes.run.snapshot import cached_properties
+from epypes.run.snapshot import cached_properties, is_own
 from epypes.wire.encoder import ValueWriter, set_sort_key
 from epypes.wire.protobuf import message_class
 
@@ -46,9 +44,6 @@ ATOMS: Final = frozenset(
 ANNOTATION: Final = " annotation of "
 CACHED: Final = " cached "
 CODE: Final = " code"
-# The folders that pip, and Debian's packages, install into.
-_INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
-_OURS: Final = frozenset({"epypes", "epypes_widgets"})
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-fA-F]+")
 # What Python adds to a class, and what is described in another way.
 _OF_EVERY_CLASS: Final = frozenset(
@@ -64,9 +59,12 @@ _OF_ENUMS: Final = frozenset(
 _OF_A_NODE: Final = frozenset({*vars(Node("", len))})
 # The registry of these is described without their cache, which each call may fill.
 _SINGLE_DISPATCH: Final = frozenset(nested_codes(functools.singledispatch.__code__))
-_CONTENTS: Final[tuple[Any, ...]] = (tuple, str, bytes, int, float, complex)
-# What an attribute in a slot, or the dict of all others, takes of an object.
-_SLOT_BYTES: Final = tuple.__itemsize__
+_NUMBERS_AND_TEXTS: Final[tuple[Any, ...]] = (tuple, str, bytes, int, float, complex)
+_CONTENTS: Final[Mapping[type, Callable[[Any], Any]]] = {
+    **{kind: kind.__getnewargs__ for kind in _NUMBERS_AND_TEXTS},
+    list: list.copy,
+    dict: dict.copy,
+}
 
 
 class Description(NamedTuple):
@@ -156,7 +154,7 @@ def _mapping(value: Any) -> Description:
     if kind not in _MAPPINGS:
         return _object(value)
     parts: list[tuple[str, Any]] = [(f"[{key!r}]", part) for key, part in value.items()]
-    if not all(type(key) in ATOMS for key in value):
+    if not all(type(key) in ATOMS and key == key for key in value):
         parts = [(" keys", [*value]), (" values", [*value.values()])]
     return Description(kind.__name__, parts=parts, is_state=True)
 
@@ -173,10 +171,10 @@ def _code(code: types.CodeType) -> Description:
 
 def _function(function: types.FunctionType) -> Description:
     code = function.__code__
-    names: Iterable[str] = code.co_freevars
-    if not is_of_library(function):
-        names = {*names, *(name for inner in nested_codes(code) for name in names_from_outside(inner))}
-    meanings = meanings_of(function, names)
+    # The code of a library says what it reads of its own module.
+    home = str(function.__globals__.get("__name__")) if is_of_library(function) else ""
+    read = () if home else (name for inner in nested_codes(code) for name in names_from_outside(inner))
+    meanings = meanings_of(function, {*code.co_freevars, *read})
     parts: list[tuple[str, Any]] = [(CODE, code)]
     parts += ((f" default of {name!r}", value) for name, value in sorted(defaults_of(function).items()))
     parts += _annotations(function)
@@ -185,11 +183,11 @@ def _function(function: types.FunctionType) -> Description:
     else:
         parts += ((f" {name!r}", meanings[name]) for name in sorted(meanings))
         parts += _marks(function)
-    return Description("function", parts=parts, module=str(function.__module__))
+    return Description("function", (home,), parts, module=str(function.__module__))
 
 
 def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str, Any]:
-    """Return what names mean to a function: what it has captured, globals or builtins; what means nothing is left out."""
+    """Return what names mean to a function, by what it has captured, its globals and the builtins."""
     cells = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
     found: dict[str, Any] = {}
     for name in names:
@@ -259,7 +257,8 @@ def _class(kind: type) -> Description:
 
 
 def _graph(cg: CompGraph) -> Description:
-    parts: list[tuple[str, Any]] = [(f" function {name!r}", function) for name, function in cg.functions.items()]
+    parts: list[tuple[str, Any]] = [(" class", type(cg))]
+    parts += ((f" function {name!r}", function) for name, function in cg.functions.items())
     parts += ((f" io of {name!r}", io) for name, io in cg.func_io.items())
     parts += ((f" default of {token!r}", value) for token, value in cg.defaults.items())
     return Description("graph", parts=parts)
@@ -269,9 +268,10 @@ def _node(node: Node) -> Description:
     """Describe a node by what it was made with, and the attributes that not every node has."""
     parts: list[tuple[str, Any]] = [(" class", type(node)), (" name", node.name)]
     parts += _graph_parts(node) if isinstance(node, Pipeline) else [(" function", node.func)]
-    if not is_installed(type(node).__module__):
+    has_own = not is_installed(type(node).__module__)
+    if has_own:
         parts += _attributes({name: value for name, value in vars(node).items() if name not in _OF_A_NODE})
-    return Description("node", parts=parts)
+    return Description("node", parts=parts, is_state=has_own)
 
 
 def _runner(runner: CompGraphRunner) -> Description:
@@ -310,15 +310,11 @@ def _object(value: Any) -> Description:
     if is_installed(kind.__module__):
         return _library_object(value)
     parts = [(" class", kind), *_own(value)]
-    # What else it is: a tuple, a list, a dict, a number; or what C keeps in it, which is seen only by a copy of it.
-    content = next((base for base in _CONTENTS if isinstance(value, base)), None)
-    if content is not None:
-        parts.append((" content", content.__getnewargs__(value)))
-    elif isinstance(value, list):
-        parts.append((" content", [*list.__iter__(value)]))
-    elif isinstance(value, dict):
-        parts.append((" content", dict(dict.items(value))))
-    elif kind.__basicsize__ > object.__basicsize__ + _SLOT_BYTES * (2 + len(_slots(kind))):
+    # What it is besides: a tuple, a list, a dict, a number; or what C keeps in it, which is seen only by a copy of it.
+    base = next(base for base in kind.__mro__ if is_installed(base.__module__))
+    if base in _CONTENTS:
+        parts.append((" content", _CONTENTS[base](value)))
+    elif base is not object:
         parts += _library_object(value).parts
     return Description(kind.__name__, parts=parts, is_state=True)
 
@@ -399,19 +395,7 @@ def describe_message(value: Any) -> Description:
 
 def is_installed(module: str) -> bool:
     """Whether a module is of an installed package, of Python's library or of EPypes."""
-    top = module.partition(".")[0]
-    if top in sys.stdlib_module_names or top in _OURS:
-        return True
-    if module == "__main__":
-        return False
-    loaded, file = sys.modules.get(module) or sys.modules.get(top), None
-    if loaded is not None:
-        file = getattr(loaded, "__file__", None)
-    else:
-        with suppress(ImportError, ValueError):
-            spec = importlib.util.find_spec(top)
-            file = spec and spec.origin
-    return not _INSTALLED.isdisjoint(Path(file or "").parts)
+    return module != "__main__" and not is_own(module.partition(".")[0])
 
 
 def _home(value: Any) -> tuple[str, str] | None:
@@ -445,11 +429,9 @@ _ATTRIBUTES: Final[Mapping[type, tuple[str, ...]]] = {
     property: ("fget", "fset", "fdel"),
     staticmethod: ("__func__",),
     classmethod: ("__func__",),
-    functools.cached_property: ("func", "attrname"),
     dataclasses.Field: (
         "name", "default", "default_factory", "init", "repr", "hash", "compare", "metadata", "kw_only", "_field_type",
     ),
-    Switch: ("branches",),
 }  # fmt: skip
 _WAYS: Final[tuple[tuple[Any, Callable[[Any], Description]], ...]] = (
     (types.FunctionType, _function),
