@@ -29,6 +29,8 @@ from epypes.bundle.notebook_source import nested_codes
 from epypes.bundle.objects import (
     ATOMS,
     CACHED,
+    Description,
+    atom_content,
     describe,
     describe_message,
     is_installed,
@@ -48,6 +50,8 @@ _READERS: Final = frozenset({
     "load", "loadtxt", "memmap", "open", "open_memmap", "read_bytes", "read_csv", "read_parquet", "read_text",
     "urlopen",
 })  # fmt: skip
+# The folders that pip, and Debian's packages, install into.
+_INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
 _LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset(
@@ -148,18 +152,15 @@ class Digester:
         self.unknown = self.unknown or (what or f"a {kind!r}") + (f" as {name!r}" if name else "")
 
     def _add(self, value: Any) -> None:
+        if type(value) in ATOMS:
+            self._put(type(value).__name__, atom_content(value))
+            return
         value = without_nodes(value)
         if id(value) in self._numbers:
             self._put("again", str(self._numbers[id(value)][0]))
             return
-        try:
-            made = describe(value)
-            home = type(value).__module__
-            if self._of_data and made.is_pickled and is_installed(home) and home.partition(".")[0] not in _DATA_MODULES:
-                made = describe_message(value)
-        except RecursionError:
-            raise
-        except Exception:  # whatever an object raises that can't be described
+        made = self._described(value)
+        if made is None:
             self._add_unknown(value)
             return
         if type(value) not in _IMMUTABLE and made.kind not in ("array", "installed"):
@@ -186,6 +187,18 @@ class Digester:
             self._path.pop()
         self._into, self._met, self._of_data = before
 
+    def _described(self, value: Any) -> Description | None:
+        """Return what a value is made of; None if its content can't be described."""
+        try:
+            made, home = describe(value), type(value).__module__
+            if self._of_data and made.is_pickled and is_installed(home) and home.partition(".")[0] not in _DATA_MODULES:
+                made = describe_message(value)
+        except RecursionError:
+            raise
+        except Exception:  # whatever an object raises
+            return None
+        return made
+
     def _read_elsewhere(self, function: types.FunctionType, parts: Mapping[str, Any]) -> list[tuple[str, Any]]:
         """Return what a function reads of the user's modules, by name; note what it reads by text or from files."""
         codes = [*nested_codes(function.__code__)]
@@ -194,13 +207,14 @@ class Digester:
         by_text = min(_BY_TEXT.intersection(dict(waiting)) - function.__globals__.keys(), default="")
         if by_text or "import_module" in used:
             self._add_unknown(function, f"a call of {by_text or 'import_module'!r}")
-        for name in _imported_within(codes, function.__globals__.get("__package__") or ""):
-            if is_installed(name):
-                self._met.add(name)
-            else:
-                with suppress(Exception):  # the function raises the same when it is called
-                    waiting.append((name, importlib.import_module(name)))
         found: list[tuple[str, Any]] = []
+        for name in _imported_within(codes, function.__globals__.get("__package__") or ""):
+            with suppress(Exception):  # the function raises the same when it is called
+                if _will_be_installed(name.partition(".")[0]):
+                    self._met.add(name)
+                else:
+                    found.append((name, importlib.import_module(name)))
+        waiting += found
         own_functions, seen = set[str](), set[str]()
         while waiting:
             name, value = waiting.pop()
@@ -226,17 +240,25 @@ def versions_of(modules: Iterable[str]) -> list[str]:
     """Return a line for each of these modules: the versions of its distributions, or the digest of its own file."""
     found = {"python": sys.version}
     for name in modules:
-        top = name.partition(".")[0]
+        top, file = name.partition(".")[0], getattr(sys.modules.get(name), "__file__", None)
         if top == _OURS:
             found[top] = metadata.version(_OURS)
-        elif is_installed(name) and top not in sys.stdlib_module_names:
+        elif top not in sys.modules or is_installed(name):
             found[top] = ", ".join(f"{one}=={metadata.version(one)}" for one in bringing(top))
-        elif file := getattr(sys.modules.get(name), "__file__", None):
+        elif file:
             found[name] = file_digest(Path(file))
     return sorted(f"{name} {version}" for name, version in found.items())
 
 
-def _imported_within(codes: Iterable[types.CodeType], package: str) -> set[str]:
+def _will_be_installed(top: str) -> bool:
+    """Whether a module, which is not imported for it, is of an installed package."""
+    if top in sys.modules:
+        return is_installed(top)
+    spec = importlib.util.find_spec(top)
+    return spec is not None and not _INSTALLED.isdisjoint(Path(spec.origin or "").parts)
+
+
+def _imported_within(codes: Iterable[types.CodeType], package: str) -> list[str]:
     """Return the names of all that code in a package may import when it runs."""
     found: set[str] = set()
     for code in codes:
@@ -248,4 +270,4 @@ def _imported_within(codes: Iterable[types.CodeType], package: str) -> set[str]:
                     name = importlib.util.resolve_name("." * level.argval + step.argval, package)
                     # A name that is taken from a package may be a module of it.
                     found |= {name, *(f"{name}.{one}" for one in taken.argval or ())}
-    return found
+    return sorted(found)

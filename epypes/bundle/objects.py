@@ -24,7 +24,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from epypes.bundle.definitions import defaults_of
 from epypes.bundle.expressions import has_steady_order
@@ -104,15 +104,21 @@ def describe(value: Any) -> Description:
     """
     kind = type(value)
     if kind in ATOMS:
-        # Python refuses to write very long numbers as decimals.
-        exact = hex(value) if kind is int else value if kind in (str, bytes) else repr(value)
-        return Description(kind.__name__, (exact,))
+        return Description(kind.__name__, (atom_content(value),))
     if is_plain_array(value) and not value.dtype.hasobject:
         return _array(value)
     if home := _home(value):
         return Description("installed", (".".join(home),), module=home[0])
     way = next((way for kinds, way in _WAYS if isinstance(value, kinds)), _object)
     return way(value)
+
+
+def atom_content(value: Any) -> str | bytes:
+    """Return a number or text exactly."""
+    if type(value) in (str, bytes):
+        return cast("str | bytes", value)
+    # Python refuses to write very long numbers as decimals.
+    return hex(value) if type(value) is int else repr(value)
 
 
 def without_nodes(value: Any) -> Any:
