@@ -1,9 +1,9 @@
 """The comparison of a notebook's objects with those that a bundle's module makes.
 
 The module is emitted by simple rules and executed once. Then one walk goes over the notebook's objects and the module's
-objects side by side: from every function over its text, defaults, closure and attributes to every global that its code
-names. The same text over the same data computes the same on every input, whatever the notebook has rebound meanwhile. A
-difference is a refusal that names the object, its cell and line.
+objects side by side, by what `objects` says that each is made of: from every function over its text, defaults, closure
+and attributes to every global that its code names. The same text over the same data computes the same on every input,
+whatever the notebook has rebound meanwhile. A difference is a refusal that names the object, its cell and line.
 
 The module is executed in the promoting process, because only there can its objects be compared with the notebook's.
 What its decorators, classes and factories do when they are called, they do once more, with objects of the module. All
@@ -168,7 +168,9 @@ class _Walk:
         elif isinstance(ours, type):
             path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours))
         elif isinstance(ours, Node):
-            left_out += tuple(f" attribute {name!r}" for name in vars(ours) if is_set_elsewhere(ours, name))
+            nodes = ours, theirs
+            names = [name for node in nodes for name in vars(node) if is_set_elsewhere(node, name)]
+            left_out += tuple(f" attribute {name!r}" for name in names)
         self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
 
     def _add_all(self, path: _Path, mine: Mapping[str, Any], others: Mapping[str, Any]) -> None:
