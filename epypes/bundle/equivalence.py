@@ -1,9 +1,9 @@
 """The comparison of a notebook's objects with those that a bundle's module makes.
 
 The module is emitted by simple rules and executed once. Then one walk goes over the notebook's objects and the module's
-objects side by side: from every function over its text, defaults, closure and attributes to every global that its code
-names. The same text over the same data computes the same on every input, whatever the notebook has rebound meanwhile. A
-difference is a refusal that names the object, its cell and line.
+objects side by side, by what `objects` says that each is made of: from every function over its text, defaults, closure
+and attributes to every global that its code names. The same text over the same data computes the same on every input,
+whatever the notebook has rebound meanwhile. A difference is a refusal that names the object, its cell and line.
 
 The module is executed in the promoting process, because only there can its objects be compared with the notebook's.
 What its decorators, classes and factories do when they are called, they do once more, with objects of the module. All
@@ -13,61 +13,29 @@ checks that need no execution are made before.
 from __future__ import annotations
 
 import ast
-import builtins
-import copyreg
 import dataclasses
-import enum
-import functools
 import linecache
 import reprlib
-import sys
 import tempfile
 import traceback
 import types
 import warnings
-import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.clone import is_set_elsewhere
-from epypes.bundle.definitions import annotated_names, defaults_of, statements_of_class
-from epypes.bundle.expressions import has_steady_order, is_data, is_same_data, write_arrays
+from epypes.bundle.definitions import annotated_names, statements_of_class
+from epypes.bundle.expressions import is_data, write_arrays
 from epypes.bundle.load import MODULE, execute
-from epypes.bundle.notebook_source import (
-    computes_the_same,
-    definition_of,
-    lambdas_of,
-    names_from_outside,
-    nested_codes,
-    place_in,
-    place_of,
-    spelled_tree,
-)
+from epypes.bundle.notebook_source import definition_of, lambdas_of, nested_codes, place_in, place_of, spelled_tree
+from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, meanings_of, without_nodes
 from epypes.bundle.resolve import layers
-from epypes.graph import CompGraph, Switch
-from epypes.pipeline import Node, Pipeline
-from epypes.run.guard import as_written, is_plain_array, is_unguarded
+from epypes.pipeline import Node
+from epypes.run import CompGraphRunner
 
-_PLAIN: Final = frozenset({int, float, complex, bool, str, bytes, type(None), type(...)})
 _DRAFT: Final = "epypes-draft-"
-_LOST: Final = object()
-# What an attribute in a slot, or the dict of all others, takes of an object.
-_SLOT: Final = tuple.__itemsize__
-# What Python and the standard library add to a class, from its text and its fields, which are compared.
-_ADDED_TO_CLASSES: Final = frozenset(
-    {"__module__", "__qualname__", "__doc__", "__dict__", "__weakref__", "__annotations__", "__orig_bases__"}
-    | {"__annotate__", "__annotate_func__", "__annotations_cache__", "__static_attributes__", "__firstlineno__"}
-    | {"_abc_impl", "__dataclass_params__", "__slotnames__", "_value2member_map_"}
-)
-_OF_DATACLASSES: Final = frozenset(
-    {"__init__", "__repr__", "__eq__", "__lt__", "__le__", "__gt__", "__ge__", "__hash__", "__setattr__"}
-    | {"__delattr__", "__replace__"}
-)
-_OF_FIELDS: Final = (
-    "name", "default", "default_factory", "init", "repr", "hash", "compare", "metadata", "kw_only", "_field_type",
-)  # fmt: skip
 _WAY_OUT: Final = (
     "The bundle would have what the text of the cells makes. Run the cells that make it again, or make it a token."
 )
@@ -101,6 +69,7 @@ class _Different(Exception):
 
 
 Pair = tuple[str, Any, Any]
+_Definition = ast.FunctionDef | ast.Lambda
 
 
 def refusal(text: str, arrays: Mapping[str, Any], pairs: Callable[[Any], Iterable[Pair]]) -> str:
@@ -158,7 +127,7 @@ class _Walk:
         """Compare all that is waiting and what it reaches; raise at the first difference."""
         while self.waiting:
             path, ours, theirs = self.waiting.popleft()
-            ours, theirs = _bare(ours), _bare(theirs)
+            ours, theirs = without_nodes(ours), without_nodes(theirs)
             self._compare_identity(path, ours, theirs)
             if ours is not theirs and (id(ours), id(theirs)) not in self._seen:
                 self._seen[id(ours), id(theirs)] = ours, theirs
@@ -169,10 +138,10 @@ class _Walk:
 
     def _compare_identity(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Note an object of one side that is several objects of the other."""
-        is_number = type(ours) in _PLAIN
-        if is_number and ours == ours:
+        is_atom = type(ours) in ATOMS
+        if is_atom and ours == ours:
             return
-        has_equals = is_data(ours) and not is_number
+        has_equals = is_data(ours) and not is_atom
         for side, (one, other) in enumerate(((ours, theirs), (theirs, ours))):
             if self._partners[side].setdefault(id(one), other) is not other:
                 where, elsewhere = _side(side == 0), _side(side == 1)
@@ -181,38 +150,28 @@ class _Walk:
 
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
-        kind = type(ours)
-        if ours is _LOST or theirs is _LOST:
-            raise _Different(path, f"{path.name} is defined only in the {'module' if ours is _LOST else 'notebook'}.")
-        if isinstance(ours, type) and isinstance(theirs, type):
-            self._compare_classes(path, ours, theirs)
-            return
-        if kind is types.FunctionType and type(theirs) is kind:
-            self._compare_functions(path, ours, theirs)
-            return
-        if kind is not type(theirs):
-            if not _is_of_notebook(kind) or kind.__name__ != type(theirs).__name__:
-                raise _unlike(path, ours, theirs)
-            self._add(path.to(" class"), kind, type(theirs))
-        if kind in _PLAIN:
-            if not is_same_data(ours, theirs):
-                raise _unlike(path, ours, theirs)
-            return
-        if is_plain_array(ours) and not ours.dtype.hasobject:
-            # A view with gaps is whole in the file that the module reads it from.
-            is_whole = ours.flags.c_contiguous or ours.flags.f_contiguous
-            if _bits(ours, is_whole) != _bits(theirs, is_whole):
-                raise _unlike(path, ours, theirs)
-            return
         try:
-            mine, others = _parts(ours), _parts(theirs)
+            if isinstance(ours, types.ModuleType | CompGraphRunner):
+                raise TypeError("what a module holds, and a runner's last run, is no part of its description")
+            mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
-            text = f"{path.name} is a {kind.__name__!r}, made anew in the module, which can't be compared."
+            text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."
             raise _Different(path, f"{text} Make it inside the function.") from error
-        self._add_all(path, mine, others)
-
-    def _add(self, path: _Path, ours: Any, theirs: Any) -> None:
-        self.waiting.append((path, ours, theirs))
+        if mine[:2] != others[:2] or (mine.kind == "array" and not _is_laid_out_as(ours, theirs)):
+            raise _unlike(path, ours, theirs)
+        left_out: tuple[str, ...] = (ANNOTATION,)
+        if isinstance(ours, types.FunctionType) and ours.__code__ is not theirs.__code__:
+            node = _definition(ours.__code__)
+            if path.part and node is not None:
+                path = _Path(path.root, _placed(f"Function {ours.__name__!r}", ours))
+            left_out += self._compare_code(path, node, ours, theirs)
+        elif isinstance(ours, type):
+            path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours))
+        elif isinstance(ours, Node):
+            nodes = ours, theirs
+            names = [name for node in nodes for name in vars(node) if is_set_elsewhere(node, name)]
+            left_out += tuple(f" attribute {name!r}" for name in names)
+        self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
 
     def _add_all(self, path: _Path, mine: Mapping[str, Any], others: Mapping[str, Any]) -> None:
         """Add parts by name, which must be the same in the same order."""
@@ -221,64 +180,36 @@ class _Walk:
             if not only:
                 raise _Different(path, f"{path.name} has another order in the module.")
             raise _Different(path, f"{path.name} has {only[0].strip()} only in the {_side(only[0] in mine)}.")
-        for part, value in mine.items():
-            self._add(path.to(part), value, others[part])
+        self.waiting.extend((path.to(part), value, others[part]) for part, value in mine.items())
 
-    def _compare_functions(self, path: _Path, ours: types.FunctionType, theirs: types.FunctionType) -> None:
-        if ours.__code__ is not theirs.__code__:
-            node = _node(ours.__code__)
-            owner = _placed(f"Function {ours.__name__!r}", ours) if path.part else path.owner
-            path = _Path(path.root, owner)
-            if not _is_same_text(ours.__code__, theirs.__code__, node):
-                raise _Different(path, "the notebook has it with another text than the cells have now.")
-            parts = [*ast.walk(node)] if node is not None else []
-            self._asks_for_identity |= any(map(_asks_for_identity, parts))
-            self._asks_for_membership |= any(isinstance(part, ast.In | ast.NotIn) for part in parts)
-            for name in annotated_names(node) if node is not None else ():
-                if _LOST not in (pair := (_meaning(ours, name), _meaning(theirs, name))):
-                    self._add(path.to(f" {name!r}"), *pair)
-        elif ours.__globals__ is not theirs.__globals__:
-            raise _Different(path, "it reads the names of another module.")
-        if is_unguarded(ours) != is_unguarded(theirs):
-            raise _Different(path, "it is marked as unguarded in one of notebook and module.")
-        self._add_all(path, _defaults(ours), _defaults(theirs))
-        self._add_all(path, _marks(ours), _marks(theirs))
-        for name in _names(ours, theirs):
-            self._add(path.to(f" {name!r}"), _meaning(ours, name), _meaning(theirs, name))
-
-    def _compare_classes(self, path: _Path, ours: type, theirs: type) -> None:
-        if not _is_of_notebook(ours) or ours.__name__ != theirs.__name__:
-            raise _unlike(path, ours, theirs)
-        path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours))
-        self._add(path.to(" metaclass"), type(ours), type(theirs))
-        self._add(path.to(" bases"), ours.__bases__, theirs.__bases__)
-        self._add(path.to(" options"), _options(ours), _options(theirs))
-        mine, others = _attributes(ours), _attributes(theirs)
-        for part in sorted(mine.keys() | others.keys(), key=lambda name: (name.startswith("__"), name)):
-            self._add(path.to(f" {part!r}"), mine.get(part, _LOST), others.get(part, _LOST))
-
-
-def _bare(value: Any) -> Any:
-    """Return the function of a node that does nothing else than call it; anything else as the notebook wrote it."""
-    value = as_written(value)
-    while type(value) is Node:
-        value = as_written(value.func)
-    return value
+    def _compare_code(
+        self, path: _Path, node: _Definition | None, ours: types.FunctionType, theirs: types.FunctionType
+    ) -> tuple[str, ...]:
+        """Compare two functions by their texts; return which parts that covers. Without a text it covers none."""
+        other = _definition(theirs.__code__)
+        if node is None and other is None:
+            return ()
+        if node is None or other is None or not _is_same_text(ours.__code__, node, theirs.__code__, other):
+            raise _Different(path, "the notebook has it with another text than the cells have now.")
+        parts = [*ast.walk(node)]
+        self._asks_for_identity |= any(map(_asks_for_identity, parts))
+        self._asks_for_membership |= any(isinstance(part, ast.In | ast.NotIn) for part in parts)
+        # What an annotation names need not be there, and is not in the instructions where annotations are read late.
+        names = {*annotated_names(node)}
+        mine, others = meanings_of(ours, names), meanings_of(theirs, names)
+        both = sorted(mine.keys() & others.keys())
+        self.waiting.extend((path.to(f" {name!r}"), mine[name], others[name]) for name in both)
+        return CODE, *(f" {name!r}" for name in names)
 
 
 def _placed(what: str, value: Any) -> str:
     """Return how a reason calls an object, with its cell and line if it is a function or class of the notebook."""
-    innermost = layers(_bare(value))[-1]
+    innermost = layers(without_nodes(value))[-1]
     if isinstance(innermost, types.FunctionType):
         return f"{what} ({place_of(innermost.__code__)})"
     statements = statements_of_class(value) if isinstance(value, type) else iter(())
     found = next((pair for pair in statements if _DRAFT not in pair[0]), None)
     return f"{what} ({place_in(found[0], found[1].lineno)})" if found else what
-
-
-def _is_of_notebook(kind: type) -> bool:
-    """Whether a class was defined in the notebook, or in a module that is no imported one, as that of a bundle."""
-    return kind.__module__ == "__main__" or kind.__module__ not in sys.modules
 
 
 def _side(is_notebook: bool) -> str:
@@ -292,10 +223,21 @@ def _unlike(path: _Path, ours: Any, theirs: Any) -> _Different:
     return _Different(path, f"{path.name} is {mine} in the notebook and {others} in the module.")
 
 
+def _is_laid_out_as(ours: Any, theirs: Any) -> bool:
+    """Whether two equal arrays lie in memory alike, which decides about the last digits of sums."""
+    # A view with gaps is whole in the file that the module reads it from.
+    is_whole = ours.flags.c_contiguous or ours.flags.f_contiguous
+    return not is_whole or not ours.size or ours.strides == theirs.strides
+
+
+def _without(parts: Iterable[tuple[str, Any]], left_out: tuple[str, ...]) -> dict[str, Any]:
+    return {label: part for label, part in parts if not label.startswith(left_out)}
+
+
 # -- functions -------------------------------------------------------------------------------------------------------
 
 
-def _node(code: types.CodeType) -> ast.FunctionDef | ast.Lambda | None:
+def _definition(code: types.CodeType) -> _Definition | None:
     """Return the definition of some code; None if there is no text that compiles to it."""
     if code.co_name != "<lambda>":
         return definition_of(code)[1]
@@ -303,16 +245,15 @@ def _node(code: types.CodeType) -> ast.FunctionDef | ast.Lambda | None:
     return nodes[0] if len({ast.dump(node) for node in nodes}) == 1 else None
 
 
-def _is_same_text(code: types.CodeType, other: types.CodeType, node: ast.FunctionDef | ast.Lambda | None) -> bool:
-    """Whether two functions have the same text over the same names; without a text, the same instructions."""
-    second = _node(other)
-    if node is None or second is None:
-        return node is second and computes_the_same(code, other)
-    # The annotations of a class inside are names only where they are not read late.
-    return _spelled(node) == _spelled(second) and _has_same_names(code, other, {*annotated_names(node)})
+def _is_same_text(code: types.CodeType, node: _Definition, other_code: types.CodeType, other: _Definition) -> bool:
+    """Whether two functions have the same text, and the same names to Python."""
+    # In a class Python calls what begins with two underscores otherwise. What is captured may be global elsewhere; the
+    # annotations of a class inside are names only where they are not read late.
+    but = {*annotated_names(node)}
+    return _spelled(node) == _spelled(other) and _names(code) - but == _names(other_code) - but
 
 
-def _spelled(node: ast.FunctionDef | ast.Lambda) -> list[object]:
+def _spelled(node: _Definition) -> list[object]:
     """Return what a definition says but for its name, decorators, defaults and annotations."""
     given = node.args
     every = ([*given.posonlyargs, None, *given.args], [given.vararg], given.kwonlyargs, [given.kwarg])
@@ -321,14 +262,12 @@ def _spelled(node: ast.FunctionDef | ast.Lambda) -> list[object]:
     return [*names, *spelled_tree(ast.Module(body, []))]
 
 
-def _has_same_names(code: types.CodeType, other: types.CodeType, but: set[str]) -> bool:
-    """Whether the names of two functions of one text mean variables of the same kind; a captured one may be global."""
-    mine, others = [*nested_codes(code)], [*nested_codes(other)]
-    return len(mine) == len(others) and all(
-        (one.co_varnames, sorted(one.co_cellvars), {*one.co_names, *one.co_freevars} - but)
-        == (two.co_varnames, sorted(two.co_cellvars), {*two.co_names, *two.co_freevars} - but)
-        for one, two in zip(mine, others, strict=True)
-    )
+def _names(code: types.CodeType) -> set[str]:
+    return {
+        name
+        for inner in nested_codes(code)
+        for name in (*inner.co_names, *inner.co_freevars, *inner.co_varnames, *inner.co_cellvars)
+    }
 
 
 def _asks_for_identity(node: ast.AST) -> bool:
@@ -338,166 +277,3 @@ def _asks_for_identity(node: ast.AST) -> bool:
     if not isinstance(node, ast.Compare) or not any(isinstance(one, ast.Is | ast.IsNot) for one in node.ops):
         return False
     return not any(isinstance(side, ast.Constant) for side in (node.left, *node.comparators))
-
-
-def _defaults(function: types.FunctionType) -> dict[str, Any]:
-    """Return the defaults of a function by how a reason calls them."""
-    return {f" default of {name!r}": value for name, value in sorted(defaults_of(function).items())}
-
-
-def _marks(function: Any) -> dict[str, Any]:
-    """Return the attributes of a function but for the marks of EPypes and what functools.wraps copies."""
-    found = {name: value for name, value in vars(function).items() if not name.startswith("__epypes_")}
-    names = sorted(found.keys() - set(functools.WRAPPER_ASSIGNMENTS))
-    if isinstance(function, types.FunctionType) and "__wrapped__" not in found:
-        found["__doc__"] = function.__doc__
-        names.append("__doc__")
-        # The module may have it under another name, unlike one that was set later.
-        if function.__name__ != function.__code__.co_name:
-            found["__name__"] = function.__name__
-            names.append("__name__")
-    return {f" attribute {name!r}": found[name] for name in names}
-
-
-def _names(ours: types.FunctionType, theirs: types.FunctionType) -> Iterator[str]:
-    """Give the names that a function reads from outside: those that it has captured, then all others."""
-    names = dict.fromkeys((*ours.__code__.co_freevars, *theirs.__code__.co_freevars))
-    if ours.__code__ is not theirs.__code__:
-        for code in nested_codes(ours.__code__):
-            names |= dict.fromkeys(names_from_outside(code))
-    yield from names
-
-
-def _meaning(function: types.FunctionType, name: str) -> Any:
-    """Return what a name means to a function; _LOST if nothing."""
-    if name in function.__code__.co_freevars:
-        cell = (function.__closure__ or ())[function.__code__.co_freevars.index(name)]
-        return cell.cell_contents if cell != types.CellType() else _LOST
-    return function.__globals__.get(name, getattr(builtins, name, _LOST))
-
-
-# -- classes and other objects ---------------------------------------------------------------------------------------
-
-
-def _attributes(kind: type) -> dict[str, Any]:
-    """Return the attributes of a class but for those that follow from its other parts."""
-    members = {*_ADDED_TO_CLASSES, *getattr(kind, "_member_map_", ())}
-    found = {
-        name: value
-        for name, value in vars(kind).items()
-        if name not in members and not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType)
-    }
-    if "__dataclass_fields__" in found:
-        # Of what dataclasses write, only the defaults may have been changed since.
-        for name in _OF_DATACLASSES & found.keys():
-            if isinstance(found[name], types.FunctionType) and _node(found[name].__code__) is None:
-                found |= {f"{name}{part}": value for part, value in _defaults(found.pop(name)).items()}
-    return found
-
-
-def _options(kind: type) -> str:
-    """Return the options of a dataclass as text; "" for any other class."""
-    return repr(vars(kind).get("__dataclass_params__", ""))
-
-
-def _bits(array: Any, with_layout: bool) -> tuple[object, ...]:
-    return array.dtype, array.shape, array.strides if with_layout and array.size else (), array.tobytes()
-
-
-def _parts(value: Any) -> dict[str, Any]:
-    """Return the parts that an object is made of, by how a reason calls them.
-
-    Raises
-    ------
-    TypeError
-        It can't be seen through.
-    """
-    if type(value) is functools.partial:
-        return {" function": value.func, " arguments": value.args, " keywords": value.keywords, **_marks(value)}
-    if type(value) in _PARTS:
-        return {f" {name}": getattr(value, name) for name in _PARTS[type(value)]}
-    if isinstance(value, functools._lru_cache_wrapper):
-        return {" parameters": value.cache_parameters(), " function": value.__wrapped__, **_marks(value)}
-    if isinstance(value, weakref.WeakKeyDictionary | weakref.WeakValueDictionary):
-        return {}  # a cache, as of functools.singledispatch
-    if type(value) in (set, frozenset):
-        return {" elements": [*value] if has_steady_order(value) else sorted(value, key=repr)}
-    if type(value) in (tuple, list):
-        return {f"[{number}]": part for number, part in enumerate(value)}
-    if type(value) in (dict, types.MappingProxyType):
-        return _of_mapping(value)
-    if isinstance(value, CompGraph):
-        return {" functions": dict(value.functions), " io": dict(value.func_io), " defaults": dict(value.defaults)}
-    if isinstance(value, enum.Enum):
-        return {" name": value.name, " value": value.value, **_own(value)}
-    if isinstance(value, Node):
-        return _of_node(value)
-    if _is_of_notebook(type(value)):
-        return {**_own(value), **_content(value)}
-    return _of_library(value)
-
-
-def _of_mapping(value: Mapping[Any, Any]) -> dict[str, Any]:
-    if all(type(key) in _PLAIN for key in value):
-        return {f"[{key!r}]": part for key, part in value.items()}
-    return {" keys": [*value], " values": [*value.values()]}
-
-
-def _of_node(node: Node) -> dict[str, Any]:
-    """Return what a node was made with, and its own attributes but for those that a run sets."""
-    found: dict[str, Any] = {" name": node.name}
-    if isinstance(node, Pipeline):
-        found |= {" graph": node.source_cg, " hyperparameters": dict(node.runner.hyperparameters)}
-        found[" workers"] = node.runner.workers
-    else:
-        found[" function"] = node.func
-    own = {name: value for name, value in vars(node).items() if not is_set_elsewhere(node, name)}
-    return found | {f" attribute {name!r}": own[name] for name in sorted(own)}
-
-
-def _own(value: Any) -> dict[str, Any]:
-    """Return the attributes of an object, also those in slots."""
-    found = {f" attribute {name!r}": part for name, part in sorted(getattr(value, "__dict__", {}).items())}
-    return found | {f" attribute {name!r}": getattr(value, name, _LOST) for name in _slots(type(value))}
-
-
-def _slots(kind: type) -> list[str]:
-    parts = (vars(base).items() for base in kind.__mro__)
-    return [name for each in parts for name, part in each if isinstance(part, types.MemberDescriptorType)]
-
-
-def _content(value: Any) -> dict[str, Any]:
-    """Return what an object of a class of the notebook has of a tuple, list, dict or number that it also is."""
-    if isinstance(value, tuple | str | bytes | int | float | complex):
-        kinds: tuple[Any, ...] = (tuple, str, bytes, int, float, complex)
-        kind = next(kind for kind in kinds if isinstance(value, kind))
-        return {" content": kind.__getnewargs__(value)}
-    if isinstance(value, list):
-        return {" content": [*list.__iter__(value)]}
-    if isinstance(value, dict):
-        return {" content": dict(dict.items(value))}
-    # What C keeps in an object is seen only by a copy of it.
-    is_plain = type(value).__basicsize__ <= object.__basicsize__ + _SLOT * (2 + len(_slots(type(value))))
-    return {} if is_plain else _of_library(value)
-
-
-def _of_library(value: Any) -> dict[str, Any]:
-    """Return what a copy of an object is made of."""
-    reduce = copyreg.dispatch_table.get(type(value))
-    made = reduce(value) if reduce is not None else value.__reduce_ex__(4)
-    if isinstance(made, str):
-        raise TypeError(made)
-    by, arguments, state, items, pairs = (*made, None, None, None)[:5]
-    found = {" maker": by, " arguments": arguments, " state": state}
-    return found | {" items": [*(items or ())], " entries": [*(pairs or ())]}
-
-
-_PARTS: Final[Mapping[type, tuple[str, ...]]] = {
-    types.MethodType: ("__func__", "__self__"),
-    property: ("fget", "fset", "fdel"),
-    staticmethod: ("__func__",),
-    classmethod: ("__func__",),
-    functools.cached_property: ("func", "attrname"),
-    dataclasses.Field: _OF_FIELDS,
-    Switch: ("branches",),
-}

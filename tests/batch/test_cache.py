@@ -151,6 +151,19 @@ FORMS = {
             def factor(self): return {}
         def f(image): return image.sum() * Mode.FINE.factor
         """,
+    "hook of an enumeration": """
+        class Mode(Enum):
+            FINE = 1
+            COARSE = 2
+            @classmethod
+            def _missing_(cls, value): return cls({})
+        def f(image): return image.sum() * Mode(9).value
+        """,
+    "factory of a dict of an own class": """
+        class Table(defaultdict): pass
+        table = Table(lambda: {})
+        def f(image): return image.sum() * table.default_factory()
+        """,
     "value in a dict": "table = dict(gain=dict(factor={}))\ndef f(image): return image.sum() * table['gain']['factor']",
     "function in a list": "steps = [lambda image: image.sum() * {}]\ndef f(image): return steps[0](image)",
     "array of objects": """
@@ -171,6 +184,7 @@ FORMS = {
     "default argument": "def f(image, gain={}): return image.sum() * gain",
 }
 BEFORE = """
+    from collections import defaultdict
     from dataclasses import dataclass, field
     from enum import Enum
     from functools import lru_cache, partial, partialmethod, singledispatch, wraps

@@ -105,13 +105,13 @@ def test_a_class_stands_before_what_is_made_of_it():
 USED = "def f(x):\n    return A().g() + x\n"
 REFUSED = {
     "another method": (f"class A:\n    def g(self):\n        return 1\nA.g = lambda self: 2\n{USED}", r"line 4\), which function 'f' needs: the notebook has it with another text"),
-    "a method more": (f"class A:\n    def g(self):\n        return self.h()\nA.h = lambda self: 2\n{USED}", r"Class 'A' \(.*, line 1\), which function 'f' needs: its 'h' is defined only in the notebook"),
+    "a method more": (f"class A:\n    def g(self):\n        return self.h()\nA.h = lambda self: 2\n{USED}", r"Class 'A' \(.*, line 1\), which function 'f' needs: it has 'h' only in the notebook"),
     "a value changed": (f"class A:\n    K = 1\n    def g(self):\n        return self.K\nA.K = 2\n{USED}", r"Class 'A' \(.*, line 1\), which function 'f' needs: its 'K' is 2 in the notebook and 1"),
-    "a value more": (f"class A:\n    def g(self):\n        return self.K\nA.K = 2\n{USED}", r"its 'K' is defined only in the notebook"),
-    "an attribute gone": (f"class A:\n    K = 1\n    def g(self):\n        return 1\ndel A.K\n{USED}", r"its 'K' is defined only in the module"),
+    "a value more": (f"class A:\n    def g(self):\n        return self.K\nA.K = 2\n{USED}", r"it has 'K' only in the notebook"),
+    "an attribute gone": (f"class A:\n    K = 1\n    def g(self):\n        return 1\ndel A.K\n{USED}", r"it has 'K' only in the module"),
     "another base": (
         f"class B:\n    def g(self):\n        return 1\nclass A(B):\n    pass\nclass B:\n    pass\n{USED}",
-        r"Class 'B' .* its 'g' is defined only in the notebook",
+        r"Class 'B' .* it has 'g' only in the notebook",
     ),
     "made in a function": (
         f"def make():\n    class A:\n        def g(self):\n            return 1\n    return A\nA = make()\n{USED}",
@@ -138,8 +138,8 @@ REFUSED = {
     ),
     "a member": ("import enum\nG = 2\nclass Kinds(enum.Enum):\n    K = G\nG = 5\ndef f(x):\n    return Kinds.K.value + x\n", r"its .*'K'.* value is 2 in the notebook and 5"),
     "a value of a class above": ("G = 2\nclass Above:\n    K = G + 1\nclass A(Above):\n    def g(self): return self.K\nG = 5\n" + USED, r"Class 'Above' .* its 'K' is 3 in the notebook and 6"),
-    "a private value more": (f"class A:\n    def g(self): return getattr(self, '_k', 1)\nA._k = 5\n{USED}", r"its '_k' is defined only in the notebook"),
-    "a number of NumPy's more": (f"import numpy as np\nclass A:\n    def g(self): return self.q\nA.q = np.float64(3)\n{USED}", r"its 'q' is defined only in the notebook"),
+    "a private value more": (f"class A:\n    def g(self): return getattr(self, '_k', 1)\nA._k = 5\n{USED}", r"it has '_k' only in the notebook"),
+    "a number of NumPy's more": (f"import numpy as np\nclass A:\n    def g(self): return self.q\nA.q = np.float64(3)\n{USED}", r"it has 'q' only in the notebook"),
     "a record that changes what it is given": (
         "import dataclasses\n@dataclasses.dataclass\nclass Twice:\n    k: float\n    def __post_init__(self):\n        self.k *= 2\n"
         "ONE = Twice(30)\ndef f(x):\n    return ONE.k + x\n", r"its 'ONE' attribute 'k' is 60 in the notebook and 120 in the module",
