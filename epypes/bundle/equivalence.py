@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.definitions import annotated_names, defaults_of, statements_of_class
 from epypes.bundle.expressions import has_steady_order, is_data, is_same_data, write_arrays
 from epypes.bundle.graphs import is_set_elsewhere
 from epypes.bundle.load import MODULE, execute
@@ -45,7 +44,7 @@ from epypes.bundle.notebook_source import (
     place_of,
     spelled_tree,
 )
-from epypes.bundle.resolve import layers
+from epypes.bundle.resolve import annotated_names, defaults_of, layers, statements_of_class
 from epypes.graph import CompGraph, Switch
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array, is_unguarded

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from epypes.bundle.definitions import functions_of
 from epypes.bundle.expressions import (
     UNKNOWN,
     Item,
@@ -21,7 +20,7 @@ from epypes.bundle.expressions import (
     quoted,
 )
 from epypes.bundle.notebook_source import nested_codes
-from epypes.bundle.resolve import Refused
+from epypes.bundle.resolve import Refused, functions_of
 from epypes.bundle.slice import Slice
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
