@@ -11,7 +11,6 @@ import ast
 import dis
 import io
 import linecache
-import os
 import re
 import sys
 import types
@@ -37,9 +36,8 @@ _Functions = dict[tuple[str, int], tuple[list[ast.FunctionDef | ast.Lambda], lis
 def executed_cells(names: Mapping[str, Any], file: str = "") -> list[tuple[int, str]]:
     """Return the cells that a notebook has executed, each with its number; outside of notebooks the text of a file."""
     cells = names.get("In")
-    if not isinstance(cells, list):
-        cells = []
-    texts = [(number, _without_magic(cell)) for number, cell in enumerate(cells) if isinstance(cell, str) and cell]
+    known = enumerate(cells if isinstance(cells, list) else [])
+    texts = [(number, _without_magic(cell)) for number, cell in known if isinstance(cell, str) and cell]
     return texts or ([(0, "".join(linecache.getlines(file)))] if file else [])
 
 
@@ -149,18 +147,15 @@ def _end(node: ast.expr) -> tuple[int, int]:
 
 def _nodes_of(code: types.CodeType) -> tuple[list[str], list[ast.FunctionDef | ast.Lambda]]:
     """Return the lines that code is from, and what stands at its place if that compiles to this very code."""
-    for _ in range(2):
-        lines = lines_in(code.co_filename)
-        functions = _functions_in("".join(lines), code.co_flags & LATE_ANNOTATIONS)
-        nodes, codes = functions.get((code.co_name, code.co_firstlineno), ([], []))
-        # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
-        same = [other for other in codes if computes_the_same(other, code)]
-        if any(code.co_name != "<lambda>" or other.co_linetable == code.co_linetable for other in same):
-            return lines, nodes
-        if os.path.isfile(code.co_filename):
-            # Lines that were remembered may be older than the file that was run last.
-            linecache.checkcache(code.co_filename)
-    return lines, []
+    linecache.checkcache(code.co_filename)  # a script may have been changed and run again
+    lines = lines_in(code.co_filename)
+    functions = _functions_in("".join(lines), code.co_flags & LATE_ANNOTATIONS)
+    nodes, codes = functions.get((code.co_name, code.co_firstlineno), ([], []))
+    same = [other for other in codes if computes_the_same(other, code)]
+    # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
+    if code.co_name == "<lambda>":
+        same = [other for other in same if other.co_linetable == code.co_linetable]
+    return lines, nodes if same else []
 
 
 @lru_cache(maxsize=16)  # one cell often defines many functions

@@ -204,21 +204,14 @@ def function_definition(function: Any, what: str) -> Definition:
     """
     *wrappers, innermost = layers(function)
     node = definition_of(innermost.__code__)[1] if isinstance(innermost, types.FunctionType) else None
-    wrapped_by = [one for one in node.decorator_list if _target(one, innermost) not in _MARKS] if node else []
-    if wrapped_by and len(wrapped_by) == len(wrappers):
-        return _of_text(innermost, what, [*zip(wrapped_by, wrappers, strict=True)])
-    if not isinstance(function, types.FunctionType):
+    decorators = [one for one in node.decorator_list if _target(one, innermost) not in _MARKS] if node else []
+    if decorators and len(decorators) == len(wrappers):
+        function = innermost
+    elif isinstance(function, types.FunctionType):
+        decorators = []
+    else:
         raise Refused(_no_definition(function, innermost, what))
-    return _of_text(function, what, ())
-
-
-# What returns the function itself; unguarded leaves something on it.
-_MARKS: Final = (unguarded, outputs)
-
-
-def _of_text(function: types.FunctionType, what: str, wrappers: Sequence[tuple[ast.expr, Any]]) -> Definition:
-    """Return the definition that this very function has; if nothing has wrapped it, without most decorators."""
-    code = function.__code__
+    code: types.CodeType = function.__code__
     place = place_of(code)
     if code.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
         raise Refused(f"{what} is asynchronous ({place}), which no graph waits for. Write a plain function (def).")
@@ -236,10 +229,13 @@ def _of_text(function: types.FunctionType, what: str, wrappers: Sequence[tuple[a
     names = {**function.__globals__, **captured} if captured else function.__globals__
     targets = {one: _target(one, function) for one in node.decorator_list}
     # A decorator that has returned the function itself may have left something on it.
-    dropped = [one for one, target in targets.items() if target is outputs or not (wrappers or target in _LEAVING)]
-    return Definition(what, node, code.co_filename, lines, names, function, captured, dropped, wrappers)
+    dropped = [one for one, target in targets.items() if target is outputs or not (decorators or target in _LEAVING)]
+    wrapped = [*zip(decorators, wrappers, strict=False)]
+    return Definition(what, node, code.co_filename, lines, names, function, captured, dropped, wrapped)
 
 
+# What returns the function itself, and what leaves something on it.
+_MARKS: Final = (unguarded, outputs)
 _LEAVING: Final = (unguarded, functools.wraps)
 
 

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import ast
 import builtins
-import dis
 import sys
 import types
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
@@ -23,7 +22,7 @@ from epypes.bundle.notebook_source import (
     parsed,
     place_in,
 )
-from epypes.bundle.resolve import Definition, Importable, Refused, captured_by, evaluated, is_of_notebook
+from epypes.bundle.resolve import Definition, Refused, captured_by, evaluated, is_of_notebook
 from epypes.run.guard import is_plain_array
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
@@ -46,43 +45,34 @@ def check_state(found: Definition) -> None:
         for function in (evaluated(called, found.names), wrapper):
             node = definition_of(function.__code__)[1] if is_of_notebook(function) else None
             if node is not None:
-                _check_function(function, node, f"{what} {node.name!r}")
-    if found.function is not None:
-        _check_function(found.function, found.node, found.what)
-    else:
-        _check_names(found.codes(), (), found.node, found.file, found.what)
+                _check_writes(node, function.__code__.co_filename, function, f"{what} {node.name!r}")
+    _check_writes(found.node, found.file, found.function, found.what)
 
 
-def _check_function(function: types.FunctionType, node: ast.AST, what: str) -> None:
-    code = function.__code__
-    codes, names = [*nested_codes(code)], {**function.__globals__, **captured_by(function)}
-    _check_names(codes, code.co_freevars, node, code.co_filename, what)
-    outside = {*code.co_freevars, *(name for inner in codes for name in names_from_outside(inner))}
-    for part in ast.walk(node):
+def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None, what: str) -> None:
+    """Refuse writes to names and objects from outside of a function; of a class, to global names alone."""
+    outside, names = set[str](), dict[str, Any]()
+    if function is not None:
+        names = {**function.__globals__, **captured_by(function)}
+        codes = nested_codes(function.__code__)
+        outside = {*function.__code__.co_freevars, *(name for code in codes for name in names_from_outside(code))}
+    parts = [*ast.walk(node)]
+    stored = {part.id: part for part in parts if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load)}
+    for part in parts:
+        if isinstance(part, ast.Global | ast.Nonlocal):
+            for name in filter(stored.__contains__, part.names):
+                if isinstance(part, ast.Global):
+                    place = place_in(file, stored[name].lineno)
+                    raise Refused(f"{what} changes the global {name!r} ({place}). Return the value.")
+                if name in outside:
+                    text = f"{what} changes {name!r} of the function around it ({place_in(file, part.lineno)})"
+                    raise Refused(f"{text}, so that the next call finds it different. Make it a token, or return it.")
         for written in _written(part):
             name = _root(written)
             is_plain = isinstance(getattr(written, "ctx", None), ast.Store | ast.Del)
             if name in outside and (is_plain or _is_container(written, names)):
-                place = place_in(code.co_filename, getattr(part, "lineno", code.co_firstlineno))
-                text = f"{what} writes into {name!r}, which outlives the call ({place})"
+                text = f"{what} writes into {name!r}, which outlives the call ({place_in(file, written.lineno)})"
                 raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
-
-
-_BINDING: Final = ("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_DEREF", "DELETE_DEREF")
-
-
-def _check_names(codes: Iterable[types.CodeType], captured: Iterable[str], node: ast.AST, file: str, what: str) -> None:
-    """Refuse what gives other values to global names, or to names of the function around it."""
-    for one in (one for code in codes for one in dis.get_instructions(code) if one.opname in _BINDING):
-        name, is_captured = one.argval, one.argval in captured
-        if is_captured or "GLOBAL" in one.opname:
-            parts = (part for part in ast.walk(node) if not isinstance(part, ast.Global))
-            uses = (part for part in parts if getattr(part, "id", "") == name or name in getattr(part, "names", ()))
-            place = place_in(file, getattr(next(uses, node), "lineno", 1))
-            text = f"{name!r} of the function around it" if is_captured else f"the global {name!r}"
-            raise Refused(
-                f"{what} changes {text} ({place}). Return the value. Make it a token if the next event needs it."
-            )
 
 
 def _written(node: ast.AST) -> Iterator[ast.expr]:
@@ -99,7 +89,8 @@ def _written(node: ast.AST) -> Iterator[ast.expr]:
 def _attribute_of(node: ast.AST, *functions: str) -> Iterator[ast.expr]:
     """Give the attribute that getattr, setattr or delattr is called with."""
     if isinstance(node, ast.Call) and getattr(node.func, "id", "") in functions and len(node.args) > 1:
-        yield ast.Attribute(node.args[0], str(getattr(node.args[1], "value", "")), ast.Store())
+        attribute = ast.Attribute(node.args[0], str(getattr(node.args[1], "value", "")), ast.Store())
+        yield ast.copy_location(attribute, node)
 
 
 def _is_container(node: ast.expr, names: Mapping[str, Any]) -> bool:
@@ -148,22 +139,12 @@ def check_patches(found: Definition) -> None:
     for owner, name in _read_by(found):
         if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
             owner, name = of_classes.get(name, (None, name))
-        if (owner, name) in known:
-            _refuse(owner, name, known[owner, name], found.what)
-
-
-def check_home(home: Importable, what: str) -> None:
-    """Refuse what can be imported only as the notebook has changed it."""
-    key = sys.modules[home.module], home.qualname.partition(".")[0]
-    place = _patches().get(key)
-    if place:
-        _refuse(*key, place, what)
-
-
-def _refuse(owner: Any, name: str, place: str, what: str) -> None:
-    spelled = name if owner is builtins else f"{owner.__name__}.{name}"
-    text = f"{what} uses {spelled!r}, which the notebook has changed ({place}); a service has it as it was installed"
-    raise Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
+        place = known.get((owner, name), "")
+        if place:
+            spelled = name if owner is builtins else f"{owner.__name__}.{name}"
+            text = f"{found.what} uses {spelled!r}, which the notebook has changed ({place})"
+            way_out = "Call yours by a name of its own, or make the value a token."
+            raise Refused(f"{text}; a service has it as it was installed. {way_out}")
 
 
 def _patches() -> dict[tuple[Any, str], str]:
@@ -171,23 +152,23 @@ def _patches() -> dict[tuple[Any, str], str]:
     names, found = vars(sys.modules["__main__"]), dict[tuple[Any, str], str]()
     script = str(names.get("__file__") or "")
     for cell, text in executed_cells(names, script):
-        for written, line in _written_in(text):
+        for written in _written_in(text):
             node = written
             while isinstance(node, ast.Attribute | ast.Subscript):
-                owner = evaluated(node.value, names)
+                owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
                 if isinstance(node, ast.Attribute) and (is_of_library or isinstance(owner, types.ModuleType)):
-                    found[owner, node.attr] = f"cell [{cell}], line {line}" if cell else f"{script}, line {line}"
+                    place = f"cell [{cell}]" if cell else script
+                    found[owner, node.attr] = f"{place}, line {written.lineno}"
                     break
                 node = node.value
     return found
 
 
 @lru_cache(maxsize=512)  # every function of a graph asks for every cell
-def _written_in(text: str) -> list[tuple[ast.expr, int]]:
+def _written_in(text: str) -> list[ast.expr]:
     tree = parsed(text)
-    nodes = ast.walk(tree) if tree else ()
-    return [(written, getattr(node, "lineno", 1)) for node in nodes for written in _written(node)]
+    return [written for node in ast.walk(tree) for written in _written(node)] if tree else []
 
 
 def _read_by(found: Definition) -> Iterator[tuple[Any, str]]:

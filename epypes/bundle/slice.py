@@ -53,7 +53,7 @@ from epypes.bundle.resolve import (
     importable,
     with_defaults,
 )
-from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state
+from epypes.bundle.side_effects import CHANGING, check_asked, check_patches, check_state
 from epypes.run.guard import is_plain_array
 
 T = TypeVar("T")
@@ -175,7 +175,6 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
-        check_home(home, what)
         top = home.qualname.partition(".")[0]
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
@@ -201,12 +200,6 @@ class Slice:
         else:
             self.claim(name, _of_object(sys.modules.get(module)), what)
             self.imports[name, module] = f"import {module} as {name}"
-
-    def _import_name(self, home: Importable, name: str, value: object, what: str) -> None:
-        self.claim(name, _of_object(value), what)
-        check_home(home, f"A function that uses {name!r}")
-        alias = "" if name == home.qualname else f" as {name}"
-        self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
 
     # -- functions and classes ---------------------------------------------------------------------------------------
 
@@ -297,8 +290,9 @@ class Slice:
         values += [(default, known[one.arg]) for default, one in by_name if default and one.arg in known]
         for default, value in values:
             if not _makes(default, value, found.names):
-                text = f"{found.what} has the default {ast.unparse(default)!r} ({found.place_in(default)})"
-                changed[default] = self._short(value, text, f"{text}, which no short expression makes again")
+                text = f"the default {ast.unparse(default)!r} ({found.place_in(default)})"
+                reason = f"{found.what} has {text}, which no short expression makes again"
+                changed[default] = self._short(value, f"{found.what}, by {text},", reason)
         return changed
 
     def _argument(self, value: Any, what: str, name: str = "") -> str:
@@ -346,7 +340,9 @@ class Slice:
         written = literal_source(value)
         home = importable(value, name) if not written or not is_short(written) else None
         if home is not None and "." not in home.qualname:  # a nested name can't be imported by itself
-            self._import_name(home, name, value, what)
+            self.claim(name, _of_object(value), what)
+            alias = "" if name == home.qualname else f" as {name}"
+            self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
             return
         text = f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it"
         inner = f"{what}, by {name!r} ({found.place_of(name)}),"
@@ -468,19 +464,18 @@ def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file:
         position = cell, node.lineno
         if not is_alone:
             return Constant(source, tuple(own), position)
-        beside = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+        behind = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+        beside = behind if behind.startswith("#") else ""
         computed = f"# {ast.unparse(given)} in the notebook"
         is_source = written is not UNKNOWN and isinstance(node, ast.Assign)
         if is_source:
             own = (ast.get_source_segment("\n".join(lines), node) or "").split("\n")
-        elif beside.startswith("#"):
-            pass
         elif written is UNKNOWN and (is_data(value) or is_plain_array(value)) and len(computed) <= LINE:
-            beside = "" if ast.unparse(ast.parse(source)) == ast.unparse(given) else computed
+            beside = beside or ("" if ast.unparse(ast.parse(source)) == ast.unparse(given) else computed)
         above, together = comment_above(lines, node.lineno), f"{own[-1]}  {beside}"
-        if beside.startswith("#") and (is_source or len(own) == 1) and len(together) <= LINE:
+        if beside and (is_source or len(own) == 1) and len(together) <= LINE:
             own[-1] = together
-        elif beside.startswith("#"):
+        elif beside:
             above.append(beside)
         return Constant(source, (*above, *own), position)
     return Constant(source, tuple(own))
