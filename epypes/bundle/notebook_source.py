@@ -79,30 +79,29 @@ def names_of(value: object, names: Mapping[str, Any]) -> list[str]:
 # -- assignments -----------------------------------------------------------------------------------------------------
 
 
-def statements_of(name: str, names: Mapping[str, Any], file: str = "") -> Iterator[tuple[Assignment, list[str], int]]:
-    """Give the statements that have given a global name its value, the last one first.
+def assignment_of(name: str, names: Mapping[str, Any], file: str = "") -> tuple[Assignment, list[str], int] | None:
+    """Return the statement that has given a global name its value last; None if there is none.
 
-    Each comes with the lines of its cell, and the cell's number, 0 in a script. ``names`` are the notebook's names;
+    It comes with the lines of its cell, and the cell's number, 0 in a script. ``names`` are the notebook's names;
     outside of notebooks the text is that of ``file``.
     """
-    for cell, text in reversed(executed_cells(names, file)):
-        for node in reversed(_assignments(text).get(name, [])):
-            yield node, text.split("\n"), cell
+    texts = reversed(executed_cells(names, file))
+    found = ((_assignments(text).get(name), text.split("\n"), cell) for cell, text in texts)
+    return next(((node, lines, cell) for node, lines, cell in found if node is not None), None)
 
 
 @lru_cache(maxsize=512)  # every constant of a graph asks for every cell
-def _assignments(text: str) -> dict[str, list[Assignment]]:
-    """Return the statements of a cell, but for those in functions and classes, by the names that they give a value."""
-    found: dict[str, list[Assignment]] = {}
+def _assignments(text: str) -> dict[str, Assignment]:
+    """Return the last statement of a cell, but for those in functions and classes, that gives each name its value."""
+    found: dict[str, Assignment] = {}
     tree = parsed(text)
     waiting: list[ast.AST] = [*reversed(tree.body)] if tree else []
     while waiting:
         node = waiting.pop()
         if isinstance(node, Assignment):
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                for part in ast.walk(target):
-                    if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
-                        found.setdefault(part.id, []).append(node)
+                parts = (part for part in ast.walk(target) if isinstance(part, ast.Name))
+                found |= {part.id: node for part in parts if isinstance(part.ctx, ast.Store)}
         elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             waiting += reversed([*ast.iter_child_nodes(node)])
     return found

@@ -19,6 +19,7 @@ from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, Final, TypeGuard
 
 from epypes.bundle.notebook_source import (
+    assignment_of,
     cell_of,
     compiled,
     definition_of,
@@ -30,7 +31,6 @@ from epypes.bundle.notebook_source import (
     parsed,
     place_in,
     place_of,
-    statements_of,
 )
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -161,8 +161,9 @@ class Definition:
         node = copy.copy(self.node)
         node.decorator_list = [one for one in node.decorator_list if one not in self.dropped]
         if isinstance(node, ast.FunctionDef):
-            node.args = with_defaults(node.args, dict.fromkeys(self.changed, ast.Constant(None)))
-        code = compiled(ast.fix_missing_locations(ast.Module([node], [])))
+            nones: dict[ast.expr, ast.expr] = {one: ast.copy_location(ast.Constant(None), one) for one in self.changed}
+            node.args = with_defaults(node.args, nones)
+        code = compiled(ast.Module([node], []))
         return [*nested_codes(code)] if code is not None else []
 
     def place_in(self, node: ast.AST) -> str:
@@ -271,8 +272,8 @@ def _no_definition(value: Any, innermost: Any, what: str) -> str:
     kind = type(owner)
     text = f"{'an' if owner is value else 'a method of an'} object of class {kind.__name__!r}"
     names = vars(sys.modules["__main__"])
-    statements = (one for name in names_of(value, names) for one in statements_of(name, names))
-    places = [f"cell [{cell}], line {node.lineno}" for node, _, cell in statements]
+    given = filter(None, (assignment_of(name, names) for name in names_of(value, names)))
+    places = [f"cell [{cell}], line {node.lineno}" for node, _, cell in given]
     methods = functions_of(kind).values() if importable(kind) is None else ()
     places += [place_of(function.__code__) for function in (*methods, innermost) if is_of_notebook(function)]
     where = f" ({places[0]})" if places else ""

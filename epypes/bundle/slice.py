@@ -36,11 +36,11 @@ from epypes.bundle.expressions import (
 from epypes.bundle.notebook_source import (
     LATE_ANNOTATIONS,
     Position,
+    assignment_of,
     cell_of,
     comment_above,
     names_from_outside,
     names_of,
-    statements_of,
 )
 from epypes.bundle.resolve import (
     Definition,
@@ -454,31 +454,29 @@ def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file:
         The file of a function that reads it.
     """
     own = laid_out(source, before=f"{name} = ")
-    for node, lines, cell in statements_of(name, names, file):
-        given = node.value
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        is_alone = isinstance(targets[0], ast.Name) and len(targets) == 1 and not isinstance(node, ast.AugAssign)
-        written = literal_value(given) if is_alone and given else UNKNOWN
-        if given is None or (written is not UNKNOWN and not is_same_data(written, value)):
-            continue
-        position = cell, node.lineno
-        if not is_alone:
-            return Constant(source, tuple(own), position)
-        behind = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
-        beside = behind if behind.startswith("#") else ""
-        computed = f"# {ast.unparse(given)} in the notebook"
-        is_source = written is not UNKNOWN and isinstance(node, ast.Assign)
-        if is_source:
-            own = (ast.get_source_segment("\n".join(lines), node) or "").split("\n")
-        elif written is UNKNOWN and (is_data(value) or is_plain_array(value)) and len(computed) <= LINE:
-            beside = beside or ("" if ast.unparse(ast.parse(source)) == ast.unparse(given) else computed)
-        above, together = comment_above(lines, node.lineno), f"{own[-1]}  {beside}"
-        if beside and (is_source or len(own) == 1) and len(together) <= LINE:
-            own[-1] = together
-        elif beside:
-            above.append(beside)
-        return Constant(source, (*above, *own), position)
-    return Constant(source, tuple(own))
+    found = assignment_of(name, names, file)
+    if found is None:
+        return Constant(source, tuple(own))
+    node, lines, cell = found
+    given = node.value or ast.Constant(None)
+    is_alone = isinstance(node, ast.AnnAssign) or [*map(type, getattr(node, "targets", ()))] == [ast.Name]
+    written = literal_value(given) if is_alone else UNKNOWN
+    if not is_alone or (written is not UNKNOWN and not is_same_data(written, value)):
+        return Constant(source, tuple(own), (cell, node.lineno))
+    behind = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+    beside = behind if behind.startswith("#") else ""
+    computed = f"# {ast.unparse(given)} in the notebook"
+    is_source = written is not UNKNOWN and isinstance(node, ast.Assign)
+    if is_source:
+        own = (ast.get_source_segment("\n".join(lines), node) or "").split("\n")
+    elif written is UNKNOWN and (is_data(value) or is_plain_array(value)) and len(computed) <= LINE:
+        beside = beside or ("" if ast.unparse(ast.parse(source)) == ast.unparse(given) else computed)
+    above, together = comment_above(lines, node.lineno), f"{own[-1]}  {beside}"
+    if beside and (is_source or len(own) == 1) and len(together) <= LINE:
+        own[-1] = together
+    elif beside:
+        above.append(beside)
+    return Constant(source, (*above, *own), (cell, node.lineno))
 
 
 # -- meanings and values ----------------------------------------------------------------------------------------------
