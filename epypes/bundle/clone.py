@@ -10,10 +10,9 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, TypeGuard
 
-from epypes.bundle.definitions import functions_of
 from epypes.bundle.expressions import is_same_data
 from epypes.bundle.notebook_source import nested_codes
-from epypes.bundle.resolve import Refused
+from epypes.bundle.resolve import Refused, functions_of
 from epypes.graph import CompGraph, with_defaults, with_functions
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner

@@ -26,12 +26,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.clone import is_set_elsewhere
-from epypes.bundle.definitions import annotated_names, statements_of_class
 from epypes.bundle.expressions import is_data, write_arrays
 from epypes.bundle.load import MODULE, execute
 from epypes.bundle.notebook_source import definition_of, lambdas_of, nested_codes, place_in, place_of, spelled_tree
 from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, meanings_of, without_nodes
-from epypes.bundle.resolve import layers
+from epypes.bundle.resolve import annotated_names, layers, statements_of_class
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
 

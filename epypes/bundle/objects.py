@@ -26,9 +26,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Final, NamedTuple, cast
 
-from epypes.bundle.definitions import defaults_of
 from epypes.bundle.expressions import has_steady_order
 from epypes.bundle.notebook_source import names_from_outside, nested_codes
+from epypes.bundle.resolve import defaults_of
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import dis
-import linecache
 import sys
 import types
 from collections import deque
@@ -17,13 +15,14 @@ from functools import lru_cache
 from typing import Any, Final
 
 from epypes.bundle.notebook_source import (
+    definition_of,
     executed_cells,
     names_from_outside,
     nested_codes,
     parsed,
     place_in,
 )
-from epypes.bundle.resolve import Importable, Refused, evaluated
+from epypes.bundle.resolve import Definition, Refused, captured_by, evaluated, is_of_notebook
 from epypes.run.guard import is_plain_array
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
@@ -36,246 +35,150 @@ CHANGING: Final = frozenset(
         *("difference_update", "intersection_update", "symmetric_difference_update", "setfield", "setflags"),
     }
 )
-_INTO: Final = frozenset(("out", "dst"))
 
 
-def root_of(node: ast.expr) -> str:
+def check_state(found: Definition) -> None:
+    """Refuse a definition of the notebook that changes something outside of it, or has a decorator that does."""
+    for decorator, wrapper in found.wrappers:
+        called = decorator.func if isinstance(decorator, ast.Call) else decorator
+        what = f"{found.what} is wrapped by a decorator, @{ast.unparse(decorator)} ({found.place_in(decorator)}):"
+        for function in (evaluated(called, found.names), wrapper):
+            node = definition_of(function.__code__)[1] if is_of_notebook(function) else None
+            if node is not None:
+                _check_writes(node, function.__code__.co_filename, function, f"{what} {node.name!r}")
+    _check_writes(found.node, found.file, found.function, found.what)
+
+
+def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None, what: str) -> None:
+    """Refuse writes to names and objects from outside of a function; of a class, to global names alone."""
+    outside, names = set[str](), dict[str, Any]()
+    if function is not None:
+        names = {**function.__globals__, **captured_by(function)}
+        codes = nested_codes(function.__code__)
+        outside = {*function.__code__.co_freevars, *(name for code in codes for name in names_from_outside(code))}
+    parts = [*ast.walk(node)]
+    stored = {part.id: part for part in parts if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load)}
+    for part in parts:
+        if isinstance(part, ast.Global | ast.Nonlocal):
+            for name in filter(stored.__contains__, part.names):
+                if isinstance(part, ast.Global):
+                    place = place_in(file, stored[name].lineno)
+                    raise Refused(f"{what} changes the global {name!r} ({place}). Return the value.")
+                if name in outside:
+                    text = f"{what} changes {name!r} of the function around it ({place_in(file, part.lineno)})"
+                    raise Refused(f"{text}, so that the next call finds it different. Make it a token, or return it.")
+        for written in _written(part):
+            name = _root(written)
+            is_plain = isinstance(getattr(written, "ctx", None), ast.Store | ast.Del)
+            if name in outside and (is_plain or _is_container(written, names)):
+                text = f"{what} writes into {name!r}, which outlives the call ({place_in(file, written.lineno)})"
+                raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
+
+
+def _written(node: ast.AST) -> Iterator[ast.expr]:
+    """Give the expressions whose objects a part of a program writes into, if they are containers or attributes."""
+    if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
+        yield node
+    if isinstance(node, ast.Call):
+        yield from _attribute_of(node, "setattr", "delattr")
+        yield from (part.value for part in node.keywords if part.arg in ("out", "dst"))
+        if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
+            yield node.func.value
+
+
+def _attribute_of(node: ast.AST, *functions: str) -> Iterator[ast.expr]:
+    """Give the attribute that getattr, setattr or delattr is called with."""
+    if isinstance(node, ast.Call) and getattr(node.func, "id", "") in functions and len(node.args) > 1:
+        attribute = ast.Attribute(node.args[0], str(getattr(node.args[1], "value", "")), ast.Store())
+        yield ast.copy_location(attribute, node)
+
+
+def _is_container(node: ast.expr, names: Mapping[str, Any]) -> bool:
+    """Whether an expression is of a kind that is written into; of no dotted name, whether that which it is of is."""
+    value = evaluated(node, names)
+    value = names.get(_root(node)) if value is None else value
+    return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
+
+
+def _root(node: ast.expr) -> str:
     """Return the name of what a subscript or attribute is of; "" if that is no name."""
     while isinstance(node, ast.Subscript | ast.Attribute):
         node = node.value
     return node.id if isinstance(node, ast.Name) else ""
 
 
+# -- what only a notebook has ----------------------------------------------------------------------------------------
+
 _ASKED: Final = {
     "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
     "display": "which shows something in the notebook; a service shows nothing. Return it as a token",
     "input": "which asks a person. Make the answer a token",
     "breakpoint": "which waits for a person. Leave it out",
-    "exit": "which ends the notebook. Raise an exception",
-    "quit": "which ends the notebook. Raise an exception",
     "globals": "all names of the notebook. Use those that you need by name",
     "eval": "which may use any name. Write what it evaluates",
     "exec": "which may use any name. Write what it runs",
-    "In": "the notebook's cells. Make the text a token",
-    "Out": "what the notebook's cells have shown. Make the value a token",
-}
-_OF_A_MODULE: Final = frozenset(
-    ["__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"]
+} | dict.fromkeys(
+    ("__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"),
+    "which is another one in a bundle. Write the value itself, or make it a token",
 )
 
 
-def check_state(function: types.FunctionType, node: ast.AST, what: str) -> None:
-    """Refuse a function of the notebook that changes something outside of it.
-
-    Parameters
-    ----------
-    function
-        The function.
-    node
-        Its definition.
-    what
-        How a reason calls it.
-    """
-    code = function.__code__
-    check_globals(code, node, code.co_filename, what)
-    check_nonlocal(function, node, what)
-    names = {**function.__globals__, **captured_by(function)}
-    outside = {*code.co_freevars, *(name for inner in nested_codes(code) for name in names_from_outside(inner))}
-    for part in ast.walk(node):
-        for written in _written(part, names):
-            name = root_of(written)
-            if name in outside:
-                place = place_in(code.co_filename, getattr(part, "lineno", code.co_firstlineno))
-                text = f"{what} writes into {name!r}, which outlives the call ({place})"
-                raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
-
-
-def _written(node: ast.AST, names: Mapping[str, Any]) -> Iterator[ast.expr]:
-    """Give the expressions whose objects a part of a function plainly writes into."""
-    if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
-        yield node
-    if isinstance(node, ast.Call):
-        if isinstance(node.func, ast.Name) and node.func.id in ("setattr", "delattr"):
-            yield from node.args[:1]
-        of = node.func.value if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING else None
-        given = [*([of] if of is not None else []), *(part.value for part in node.keywords if part.arg in _INTO)]
-        yield from (part for part in given if _is_container(evaluated(part, names), names.get(root_of(part))))
-
-
-def _is_container(value: Any, root: Any) -> bool:
-    """Whether a value is of a kind that is written into; of what is no name, whether that in which it is found is."""
-    value = root if value is None else value
-    return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
-
-
-def check_globals(code: types.CodeType, node: ast.AST, file: str, what: str) -> None:
-    """Refuse what changes global names of the notebook."""
-    for inner in nested_codes(code):
-        for instruction in dis.get_instructions(inner):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                name = instruction.argval
-                uses = (part.lineno for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == name)
-                place = place_in(file, next(uses, code.co_firstlineno))
-                raise Refused(f"{what} changes the global {name!r} ({place}). Return the value.")
-
-
-def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> None:
-    """Refuse a function that keeps something from call to call in the function around it."""
-    code = function.__code__
-    for part in ast.walk(node):
-        kept = [name for name in part.names if name in code.co_freevars] if isinstance(part, ast.Nonlocal) else []
-        if kept and isinstance(part, ast.Nonlocal):
-            text = f"{what} changes {kept[0]!r} of the function around it ({place_in(code.co_filename, part.lineno)})"
-            raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
-
-
-def captured_by(function: types.FunctionType) -> dict[str, Any]:
-    """Return what a function has from the functions around it, by name; nothing of a name without a value."""
-    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    return {name: cell.cell_contents for name, cell in cells if cell != types.CellType()}
-
-
-def check_asked(name: str, value: Any, found: Any, what: str) -> None:
+def check_asked(name: str, found: Definition) -> None:
     """Refuse a name that means something in a notebook alone."""
-    if name in _ASKED and not (isinstance(value, types.FunctionType) and value.__module__ == "__main__"):
-        raise Refused(f"{what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")
-    if name == "vars" and any(map(_asks_for_names, ast.walk(found.node))):
-        raise Refused(f"{what} uses 'vars()' ({found.place_of(name)}), all names there are. Use those that you need.")
-    if name in _OF_A_MODULE:
-        text = f"{what} uses {name!r} ({found.place_of(name)}), which is another one in a bundle"
-        raise Refused(f"{text}. Write the value itself, or make it a token.")
-
-
-def _asks_for_names(node: ast.AST) -> bool:
-    """Whether this is ``vars()``, or a module's."""
-    is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "vars"
-    return isinstance(node, ast.Call) and is_call and not any(isinstance(part, ast.Name) for part in node.args)
+    if name in _ASKED and not is_of_notebook(found.names.get(name)):
+        raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")
 
 
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
-_Key = tuple[types.ModuleType | type, str]
+
+def check_patches(found: Definition) -> None:
+    """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
+    known = _patches()
+    of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
+    for owner, name in _read_by(found):
+        if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
+            owner, name = of_classes.get(name, (None, name))
+        place = known.get((owner, name), "")
+        if place:
+            spelled = name if owner is builtins else f"{owner.__name__}.{name}"
+            text = f"{found.what} uses {spelled!r}, which the notebook has changed ({place})"
+            way_out = "Call yours by a name of its own, or make the value a token."
+            raise Refused(f"{text}; a service has it as it was installed. {way_out}")
 
 
-def check_patches(found: Any, what: str) -> None:
-    """Refuse a definition that reads what the notebook has changed in a module."""
-    known, names = _patched(), {**found.names, **_imports_of(found.node)}
-    # A module by itself, as in getattr(module, name), may be asked for any name.
-    dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
-    for node in ast.walk(found.node):
-        if isinstance(node, ast.Name) and (builtins, node.id) in known:
-            _refuse(what, node.id, known[builtins, node.id])
-        for (owner, name), place in known.items():
-            is_asked = isinstance(owner, type) or id(node) not in dotted
-            if is_asked and _is_of(node, owner, name, names):
-                _refuse(what, f"{owner.__name__}.{name}", place)
-    for chain in _read_by(found.node):
-        key = _key(chain, names)
-        value = getattr(*key, None) if key is not None and key[0].__name__ != "__main__" else None
-        is_own = isinstance(value, types.FunctionType | type) and value.__module__ == "__main__"
-        if key is not None and (is_own or key in known):
-            _refuse(what, ".".join(chain), known.get(key, found.place))
-
-
-def _is_of(node: ast.AST, owner: types.ModuleType | type, name: str, names: Mapping[str, Any]) -> bool:
-    """Whether a part of a definition reads an attribute of this name of any object, or the module or class itself."""
-    if isinstance(owner, type) and isinstance(node, ast.Attribute) and node.attr == name:
-        return True
-    return isinstance(node, ast.Name | ast.Attribute) and evaluated(node, names) is owner
-
-
-def check_home(home: Importable, what: str) -> None:
-    """Refuse what can be imported only as the notebook has changed it."""
-    place = _patched().get((sys.modules[home.module], home.qualname.partition(".")[0]))
-    if place:
-        _refuse(what, f"{home.module}.{home.qualname}", place)
-
-
-def _refuse(what: str, name: str, place: str) -> None:
-    text = f"{what} uses {name!r}, which the notebook has changed ({place}); a service has it as it was installed"
-    raise Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
-
-
-def _patched() -> dict[_Key, str]:
-    """Return what the notebook has changed, by module and name there, each with its place."""
-    names = vars(sys.modules["__main__"])
-    texts = executed_cells(names)
-    script = names.get("__file__")
-    if not texts and isinstance(script, str):
-        texts = [(0, "".join(linecache.getlines(script)))]
-    found = {}
-    for cell, text in texts:
-        for chain, line in _patches_in(text):
-            key = _key(chain, names)
-            if key:
-                found[key] = f"cell [{cell}], line {line}" if cell else place_in(str(script), line)
+def _patches() -> dict[tuple[Any, str], str]:
+    """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
+    names, found = vars(sys.modules["__main__"]), dict[tuple[Any, str], str]()
+    script = str(names.get("__file__") or "")
+    for cell, text in executed_cells(names, script):
+        for written in _written_in(text):
+            node = written
+            while isinstance(node, ast.Attribute | ast.Subscript):
+                owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
+                is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
+                if isinstance(node, ast.Attribute) and (is_of_library or isinstance(owner, types.ModuleType)):
+                    place = f"cell [{cell}]" if cell else script
+                    found[owner, node.attr] = f"{place}, line {written.lineno}"
+                    break
+                node = node.value
     return found
-
-
-def _key(chain: tuple[str, ...], names: Mapping[str, Any]) -> _Key | None:
-    """Return the module, or class of a library, of a dotted name, and what is read of it; None for anything else."""
-    reached = names.get(chain[0])
-    for part in chain[1:]:
-        if isinstance(reached, type) and reached.__module__ != "__main__":
-            return reached, part
-        if not isinstance(reached, types.ModuleType):
-            return None
-        inner = getattr(reached, part, None)
-        if not isinstance(inner, types.ModuleType):
-            return reached, part
-        reached = inner
-    return None
 
 
 @lru_cache(maxsize=512)  # every function of a graph asks for every cell
-def _patches_in(text: str) -> tuple[tuple[tuple[str, ...], int], ...]:
-    """Return the dotted names that a cell writes into, with their lines."""
+def _written_in(text: str) -> list[ast.expr]:
     tree = parsed(text)
-    found = [(chain, getattr(node, "lineno", 1)) for node in ast.walk(tree) for chain in _targets(node)] if tree else []
-    return tuple(found)
+    return [written for node in ast.walk(tree) for written in _written(node)] if tree else []
 
 
-def _targets(node: ast.AST) -> Iterator[tuple[str, ...]]:
-    parts: list[ast.AST] = []
-    more: tuple[str, ...] = ()
-    if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del):
-        parts = [node]
-    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
-        parts = [node.func.value]
-    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("setattr", "delattr"):
-        parts, name = list(node.args[:1]), node.args[1] if len(node.args) > 1 else None
-        more = (str(name.value),) if isinstance(name, ast.Constant) else ()
-    chains = (dotted_name(part) + more for part in parts)
-    yield from (chain for chain in chains if len(chain) > 1)
-
-
-def dotted_name(node: ast.AST) -> tuple[str, ...]:
-    """Return the dotted name that an expression begins with; nothing if it is none."""
-    parts: list[str] = []
-    while isinstance(node, ast.Attribute | ast.Subscript):
-        parts = [node.attr, *parts] if isinstance(node, ast.Attribute) else []
-        node = node.value
-    return (node.id, *parts) if isinstance(node, ast.Name) else ()
-
-
-def _read_by(tree: ast.AST) -> Iterator[tuple[str, ...]]:
-    """Give the dotted names that a definition reads, and what it imports from modules."""
-    for node in ast.walk(tree):
-        chain = dotted_name(node) if isinstance(node, ast.Attribute) else ()
-        if len(chain) > 1:
-            yield chain
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield from ((f"from {node.module}", alias.name) for alias in node.names)
-
-
-def _imports_of(tree: ast.AST) -> dict[str, Any]:
-    """Return what a definition imports itself, by name, and the modules of which it imports names."""
-    found: dict[str, Any] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module:
-            module = found[f"from {node.module}"] = sys.modules.get(node.module)
-            found |= {alias.asname or alias.name: getattr(module, alias.name, None) for alias in node.names}
-        for alias in node.names if isinstance(node, ast.Import) else ():
-            dotted = alias.name if alias.asname else alias.name.partition(".")[0]
-            found[alias.asname or dotted] = sys.modules.get(dotted)
-    return found
+def _read_by(found: Definition) -> Iterator[tuple[Any, str]]:
+    """Give the attributes that a definition reads, also by an import or by getattr, each with what it reads it of."""
+    names = {**sys.modules, **found.names}  # it may import modules itself
+    for node in ast.walk(found.node):
+        if isinstance(node, ast.ImportFrom):
+            yield from ((sys.modules.get(node.module or ""), alias.name) for alias in node.names)
+        for read in (node, *_attribute_of(node, "getattr")):
+            if isinstance(read, ast.Attribute):
+                yield evaluated(read.value, names), read.attr
+            elif isinstance(read, ast.Name):
+                yield builtins, read.id

@@ -8,7 +8,10 @@ from __future__ import annotations
 import ast
 import builtins
 import importlib
+import io
+import re
 import sys
+import tokenize
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +19,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, TypeVar
 
-from epypes.bundle.definitions import Definition, annotated_names, class_definition, defaults_of, function_definition
 from epypes.bundle.expressions import (
     LINE,
     UNKNOWN,
@@ -32,23 +34,27 @@ from epypes.bundle.expressions import (
     names_in,
 )
 from epypes.bundle.notebook_source import (
+    LATE_ANNOTATIONS,
     Position,
-    Statement,
+    assignment_of,
     cell_of,
-    code_on_its_own,
     comment_above,
-    inside_function,
     names_from_outside,
     names_of,
-    nested_codes,
-    renamed,
-    statements_of,
-    with_defaults,
-    written_defaults,
 )
-from epypes.bundle.resolve import Importable, Refused, evaluated, importable
-from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state, dotted_name
-from epypes.run.guard import WATCH, is_plain_array
+from epypes.bundle.resolve import (
+    Definition,
+    Importable,
+    Refused,
+    annotated_names,
+    class_definition,
+    evaluated,
+    function_definition,
+    importable,
+    with_defaults,
+)
+from epypes.bundle.side_effects import CHANGING, check_asked, check_patches, check_state
+from epypes.run.guard import is_plain_array
 
 T = TypeVar("T")
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -115,7 +121,7 @@ class Slice:
         self._reserved = reserved
         self._meanings: dict[str, Meaning] = {}
         self._known: dict[int, str] = {}
-        self._unfinished: set[int] = set()
+        self._unfinished: set[str] = set()
         self._makers: dict[tuple[str, str], str] = {}
         self._notebook: Mapping[str, Any] = {}
 
@@ -140,10 +146,8 @@ class Slice:
         if name in self._reserved:
             raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
         if self._meanings.setdefault(name, meaning) != meaning:
-            raise Refused(
-                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
-                "Rename one of the two."
-            )
+            text = f"{what} uses the name {name!r}, which means something else in another function of the graph."
+            raise Refused(f"{text} Rename one of the two.")
 
     def is_taken(self, name: str) -> bool:
         """Whether a name means something in the module already."""
@@ -171,7 +175,6 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
-        check_home(home, what)
         top = home.qualname.partition(".")[0]
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
@@ -191,20 +194,12 @@ class Slice:
 
     def _import_module(self, module: str, name: str, what: str) -> None:
         if name == module:
-            self.claim(module.partition(".")[0], ("module", module.partition(".")[0]), what)
-            self.imports[module, module] = f"import {module}"
+            top = module.partition(".")[0]
+            self.claim(top, _of_object(sys.modules.get(top)), what)
+            self.imports[name, module] = f"import {module}"
         else:
             self.claim(name, _of_object(sys.modules.get(module)), what)
             self.imports[name, module] = f"import {module} as {name}"
-
-    def _import_from(self, home: Importable, name: str) -> None:
-        check_home(home, f"A function that uses {name!r}")
-        if "." in home.qualname:  # a nested name can't be imported by itself
-            raise Refused(
-                f"{name!r} is {home.module}.{home.qualname}, a name inside a class. Use it through the class."
-            )
-        alias = "" if name == home.qualname else f" as {name}"
-        self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
 
     # -- functions and classes ---------------------------------------------------------------------------------------
 
@@ -214,11 +209,11 @@ class Slice:
         if home is not None:
             return self.reference(home, what)
         if id(kind) not in self._known:
-            is_known = self._notebook.get(kind.__name__) is kind
-            found = class_definition(kind, self._notebook if is_known else vars(sys.modules["__main__"]), what)
-            self.claim(found.name, _of_object(kind), what)
-            self._known[id(kind)] = found.name
-            self._write(found.name, found.text, found, what, {found.name})
+            found = class_definition(kind, self._notebook or vars(sys.modules["__main__"]), what)
+            check_state(found)
+            self.claim(kind.__name__, _of_object(kind), what)
+            self._known[id(kind)] = kind.__name__
+            self._write(kind.__name__, _text(found, kind.__name__), found)
         return self._known[id(kind)]
 
     def add_function(self, function: Any, what: str, wanted: str = "") -> str:
@@ -228,11 +223,13 @@ class Slice:
         """
         if id(function) in self._known:
             return self._known[id(function)]
-        name, owner = getattr(function, "__name__", ""), _owner_of(function)
-        if owner is not UNKNOWN:
+        name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
+        is_bound = isinstance(function, types.MethodType | types.BuiltinMethodType)
+        can_be_read = isinstance(owner, type) or (name not in CHANGING and literal_source(owner))
+        if is_bound and can_be_read and getattr(owner, name, None) == function:
             source = expression(self, owner, f"What {what[0].lower()}{what[1:]} is of")
             return f"{f'({source})' if source[0].isdecimal() or source[0] == '-' else source}.{name}"
-        if type(function) is partial and not function.__dict__.keys() - {WATCH}:
+        if type(function) is partial:
             inner = f"The function of {what[0].lower()}{what[1:]}"
             parts = [expression(self, function.func, inner, wanted)]
             parts += [self._argument(value, what) for value in function.args]
@@ -243,90 +240,85 @@ class Slice:
     def _add_definition(self, function: Any, what: str, wanted: str) -> str:
         """Add a function that has a text; return its name."""
         found = function_definition(function, what)
+        check_state(found)
         self._notebook = self._notebook or found.names
         name = self._name_for(function, found, wanted)
         self.claim(name, _of_object(function), what)
         self._known[id(function)] = name
-        self._unfinished.add(id(function))
-        if found.function is not None:
-            check_state(found.function, found.node, what)
-        changed = self._changed_defaults(found, what)
-        text = with_defaults(found.text, changed)
-        code = code_on_its_own(with_defaults(found.text, dict.fromkeys(changed, "None")))
-        found = replace(found, code=code or found.code)
+        self._unfinished.add(name)
+        found = replace(found, changed=self._changed_defaults(found))
         own = next((each for each, value in found.captured.items() if value is function), "")
         given = {each: self._argument(value, what, each) for each, value in found.captured.items() if each != own}
         # What needs a closure that is not written yet is read by a global name, which may be given its value later.
-        unfinished = {self._known[known] for known in self._unfinished}
-        given = {each: source for each, source in given.items() if not names_in(source) & unfinished}
+        given = {each: source for each, source in given.items() if not names_in(source) & self._unfinished}
         if given or own not in ("", name):
-            inner = own or found.name
-            self._write_closure(name, renamed(text, found.name, inner), inner, given, found, what)
+            self._write_closure(name, own or found.node.name, given, found)
         else:
-            self._write(name, renamed(text, found.name, name), found, what)
-        self._unfinished.discard(id(function))
+            self._write(name, _text(found, name), found)
+        self._unfinished.discard(name)
         return name
 
-    def _write_closure(
-        self, name: str, text: str, inner: str, given: Mapping[str, str], found: Definition, what: str
-    ) -> None:
+    def _write_closure(self, name: str, inner: str, given: Mapping[str, str], found: Definition) -> None:
         """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
-        whole = inside_function(f"({', '.join(given)}):", text, inner)
+        whole = f"({', '.join(given)}):\n{_text(found, inner, depth=1)}\n    return {inner}\n"
         qualname = found.function.__code__.co_qualname if found.function else ""
         around = qualname.rpartition(".<locals>")[0].rpartition(".")[2] or f"make_{inner}"
-        key = (around, whole)
-        if key not in self._makers:
-            self._makers[key] = factory = identifier_of(around, self.is_taken)
-            self.claim(factory, ("closure", whole), what)
-            self._write(factory, f"def {factory}{whole}", found, what, {*given, inner})
+        if (around, whole) not in self._makers:
+            self._makers[around, whole] = factory = identifier_of(around, self.is_taken)
+            self.claim(factory, ("closure", whole), found.what)
+            self._write(factory, f"def {factory}{whole}", found, {*given, inner})
         arguments = ", ".join(f"{each}={source}" for each, source in given.items())
-        self.definitions[name] = f"{name} = {self._makers[key]}({arguments})\n"
+        self.definitions[name] = f"{name} = {self._makers[around, whole]}({arguments})\n"
         self.positions[name] = _position(found)
         self.closures.add(name)
 
     def _name_for(self, function: object, found: Definition, wanted: str) -> str:
         """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
-        own = "" if found.is_lambda else found.name
-        known = [own] if found.names.get(own) is function else []
-        candidates = [*known, *names_of(function, found.names), wanted, own]
+        own = "" if found.is_lambda else found.node.name
+        candidates = [*names_of(function, found.names), wanted, own]
         free = (name for name in candidates if name and self._is_free(name, function))
-        return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
+        return next(free, "") or identifier_of(own or wanted or found.node.name, self.is_taken)
 
-    def _changed_defaults(self, found: Definition, what: str) -> dict[str, str]:
-        """Return expressions of the defaults whose text makes another value than the function has, by parameter."""
-        if not isinstance(found.node, ast.FunctionDef) or found.function is None:
+    def _changed_defaults(self, found: Definition) -> dict[ast.expr, str]:
+        """Return expressions of the defaults whose text makes another value than the function has."""
+        function, node, changed = found.function, found.node, dict[ast.expr, str]()
+        if function is None or not isinstance(node, ast.FunctionDef):
             return {}
-        known, changed = defaults_of(found.function), dict[str, str]()
-        for parameter, default in written_defaults(found.node):
-            if parameter not in known or _makes(default, known[parameter], found.names):
-                continue
-            changed[parameter] = source = expression(self, known[parameter], f"Its default of {parameter!r}")
-            if not source or not is_short(source):
-                text = f"{what} has the default {ast.unparse(default)!r} ({found.place_in(default)})"
-                way_out = _way_out(known[parameter], "it")
-                raise Refused(f"{text}, which no short expression makes again. {way_out}.")
+        values = [*zip(node.args.defaults[::-1], (function.__defaults__ or ())[::-1], strict=False)]
+        by_name = [*zip(node.args.kw_defaults, node.args.kwonlyargs, strict=True)]
+        known = function.__kwdefaults__ or {}
+        values += [(default, known[one.arg]) for default, one in by_name if default and one.arg in known]
+        for default, value in values:
+            if not _makes(default, value, found.names):
+                text = f"the default {ast.unparse(default)!r} ({found.place_in(default)})"
+                reason = f"{found.what} has {text}, which no short expression makes again"
+                changed[default] = self._short(value, f"{found.what}, by {text},", reason)
         return changed
 
     def _argument(self, value: Any, what: str, name: str = "") -> str:
         """Return the expression of what a partial was given, or what a closure has captured."""
         inner = f"A function that {what[0].lower()}{what[1:]} has" if callable(value) else what
-        source = expression(self, value, inner, name)
-        if not source or not (is_short(source) or callable(value)):
-            text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
-            raise Refused(f"{text}. {_way_out(value, 'it')}.")
-        return source
+        text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
+        return self._short(value, inner, text, name)
 
-    def _write(self, name: str, text: str, found: Definition, what: str, own: Collection[str] = ()) -> None:
-        """Write a definition, after what it reads from outside; ``own`` are the names that are its own."""
+    def _short(self, value: Any, what: str, reason: str, wanted: str = "", name: str = "it") -> str:
+        """Return the expression of a value; refuse one without an expression that people still read, with a reason."""
+        source = expression(self, value, what, wanted)
+        if source and (is_short(source) or callable(value)):
+            return source
+        token = "a token, make it " if is_data(value) or is_plain_array(value) else ""
+        raise Refused(f"{reason}. Make {name} {token}inside the function, or in a module that is imported.")
+
+    def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
+        """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
-        check_patches(found, what)
-        _check_imports(found, what)
-        read = dict.fromkeys(each for code in nested_codes(found.code) for each in names_from_outside(code))
-        self.reads[name] = frozenset(read.keys() - set(own))
+        check_patches(found)
+        read = dict.fromkeys(each for code in found.codes() for each in names_from_outside(code))
+        self.reads[name] = frozenset(read.keys() - {*own})
         for needed in read:
             if needed not in own:
                 with self.noted_refusals():
-                    self._add_name(needed, found, what)
+                    self._add_name(needed, found, found.what)
         self.definitions[name] = text
         self.positions[name] = _position(found)
 
@@ -334,63 +326,46 @@ class Slice:
 
     def _add_name(self, name: str, found: Definition, what: str) -> None:
         """Add what one global name of a definition means at the time of promotion."""
-        value = found.names.get(name)
-        check_asked(name, value, found, what)
+        check_asked(name, found)
         if name not in found.names:
-            self._add_builtin(name, found, what)
+            self._add_builtin(name, found)
             return
-        self.read[name] = value
+        self.read[name] = value = found.names[name]
         if isinstance(value, types.ModuleType):
-            self._add_module(name, value, found, what)
+            # Submodules that are reached as attributes (skimage.filters) need imports of their own.
+            dotted = _submodules(found.node, name, value) if name == value.__name__ else ()
+            for module in dotted or (value.__name__,):
+                self._import_module(module, module if dotted else name, what)
             return
-        home = importable(value, name) if callable(value) or not is_data(value) else None
-        if home is not None:
+        written = literal_source(value)
+        home = importable(value, name) if not written or not is_short(written) else None
+        if home is not None and "." not in home.qualname:  # a nested name can't be imported by itself
             self.claim(name, _of_object(value), what)
-            self._import_from(home, name)
+            alias = "" if name == home.qualname else f" as {name}"
+            self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
             return
-        around = f"which {what[0].lower()}{what[1:]}"
+        text = f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it"
+        inner = f"{what}, by {name!r} ({found.place_of(name)}),"
         if isinstance(value, type):
-            source = self.add_class(value, f"Class {value.__name__!r}, {around} uses,")
+            inner = f"Class {value.__name__!r}, which {what[0].lower()}{what[1:]} uses,"
         elif callable(value):
-            source = expression(self, value, f"Function {name!r}, {around} calls,", name)
-        else:
-            source = expression(self, value, f"{what}, by {name!r} ({found.place_of(name)}),", name)
-        if not source or not (is_short(source) or callable(value)):
-            shared = _home_of_data(value)
-            if shared is None:
-                text = f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it"
-                raise Refused(f"{text}, of type {type(value).__name__}. {_way_out(value, name)}.")
-            self.claim(name, ("constant", name), what)
-            self._import_from(shared, name)
-        elif source != name:
-            self._add_constant(name, value, source, found, what)
+            inner = f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,"
+        source = self._short(value, inner, f"{text}, of type {type(value).__name__}", name, name)
+        if source != name:
+            self.claim(name, ("constant", source), what)
+            if name not in self.constants:
+                self.constants[name] = constant(name, source, value, found.names, found.file)
 
-    def _add_builtin(self, name: str, found: Definition, what: str) -> None:
+    def _add_builtin(self, name: str, found: Definition) -> None:
         """Add a name that is no global of the notebook."""
+        flags = found.function.__code__.co_flags if found.function else 0
         if hasattr(builtins, name):
-            self.claim(name, ("builtin", name), what)
-        elif found.has_late_annotations and name in annotated_names(found.node):
+            self.claim(name, ("builtin", name), found.what)
+        elif flags & LATE_ANNOTATIONS and name in annotated_names(found.node):
             self.imports["annotations", "__future__.annotations"] = "from __future__ import annotations"
         else:
             place = found.place_of(name)
-            raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
-
-    def _add_module(self, name: str, module: types.ModuleType, found: Definition, what: str) -> None:
-        if module.__name__ == "__main__":
-            text = f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)})"
-            raise Refused(f"{text}. Use what it has by its own name, without the module.")
-        if name != module.__name__:
-            self._import_module(module.__name__, name, what)
-            return
-        for dotted in _submodules(found.node, name, module) or (name,):
-            self._import_module(dotted, dotted, what)
-
-    def _add_constant(self, name: str, value: Any, source: str, found: Definition, what: str) -> None:
-        self.claim(name, ("constant", name), what)
-        known = self.constants.setdefault(name, constant(name, source, value, found.names, found.file))
-        if known.source != source:
-            place = found.place_of(name)
-            raise Refused(f"{what} uses {name!r} ({place}), which has another value elsewhere. Rename one of the two.")
+            raise Refused(f"{found.what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
 
     def add_constant(self, name: str, source: str) -> str:
         """Add a constant that the notebook has under no name; return its name, which is like this one."""
@@ -399,6 +374,49 @@ class Slice:
             known = self.free_name(name)
             self.constants[known] = Constant(source, tuple(laid_out(source, before=f"{known} = ")))
         return known
+
+
+# -- the text of definitions -----------------------------------------------------------------------------------------
+
+
+def _text(found: Definition, name: str, depth: int = 0) -> str:
+    """Return a definition under a name, with its values as defaults, indented to a depth, with the comment above it.
+
+    Lines that begin inside of a string literal stay as they are.
+    """
+    node, first, lines, pad = found.node, found.line - 1, [*found.lines], "    " * depth
+    above = "".join(f"{pad}{line}\n" for line in comment_above(lines, found.line))
+    if found.is_lambda and isinstance(node, ast.FunctionDef):
+        sources = {default: ast.parse(source, mode="eval").body for default, source in found.changed.items()}
+        head = f"{pad}def {name}({ast.unparse(with_defaults(node.args, sources))}):"
+        body = laid_out(ast.unparse(node.body[0]).removeprefix("return "), depth + 1, "return ")
+        # The comment is about all lambdas of the line.
+        return (above if lines[first].count("lambda") == 1 else "") + "\n".join([head, *body, ""])
+    inside = _lines_in_strings("".join(lines[first : node.end_lineno]))
+    margin = len(lines[first]) - len(lines[first].lstrip())
+    for default in sorted(found.changed, key=lambda each: (each.lineno, each.col_offset), reverse=True):
+        start, end = default.lineno - 1, default.end_lineno or 0
+        before = lines[start].encode()[: default.col_offset].decode()
+        after = lines[end - 1].encode()[default.end_col_offset :].decode()
+        lines[start:end] = [before + found.changed[default] + after, *[""] * (end - start - 1)]
+    for decorator in found.dropped:
+        for number in range(decorator.lineno - 1, decorator.end_lineno or 0):
+            lines[number] = ""
+    lines[node.lineno - 1] = re.sub(rf"\bdef(\s+){node.name}\b", rf"def\g<1>{name}", lines[node.lineno - 1], count=1)
+    for number, line in enumerate(lines[first : node.end_lineno], first):
+        if line and number - first + 1 not in inside:
+            # Comments and what is in brackets may stand before the margin.
+            lines[number] = re.sub(rf"\s{{0,{margin}}}", pad, line, count=1) if line.strip() else "\n"
+    return above + "".join(lines[first : node.end_lineno]).rstrip() + "\n"
+
+
+def _lines_in_strings(text: str) -> set[int]:
+    """Return the numbers of the lines that begin inside of a string literal, or of the text of an f-string."""
+    found: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if tokenize.tok_name[token.type].endswith(("STRING", "STRING_MIDDLE")):
+            found.update(range(token.start[0] + 1, token.end[0] + 1))
+    return found
 
 
 # -- constants -------------------------------------------------------------------------------------------------------
@@ -435,36 +453,30 @@ def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file:
     file
         The file of a function that reads it.
     """
-    plain = laid_out(source, before=f"{name} = ")
-    for statement in statements_of(name, names, file):
-        node, given = statement.node, getattr(statement.node, "value", None)
-        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
-        is_alone = len(targets) == 1 and isinstance(targets[0], ast.Name) and not isinstance(node, ast.AugAssign)
-        written = literal_value(given) if is_alone and given is not None else UNKNOWN
-        if given is None or (written is not UNKNOWN and not is_same_data(written, value)):
-            continue
-        is_computed = written is UNKNOWN and (is_data(value) or is_plain_array(value))
-        lines = _with_comments(plain, statement, given, is_computed, written is not UNKNOWN) if is_alone else plain
-        return Constant(source, tuple(lines), (statement.cell, node.lineno))
-    return Constant(source, tuple(plain))
-
-
-def _with_comments(
-    plain: list[str], statement: Statement, given: ast.expr, is_computed: bool, is_literal: bool
-) -> list[str]:
-    """Return the lines of a constant as the notebook has them if they are a literal; else with how it was computed."""
-    node, lines = statement.node, statement.lines
-    above = comment_above(lines, node.lineno)
-    beside = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
-    beside = beside if beside.startswith("#") else ""
-    text = ast.get_source_segment("\n".join(lines), node) if isinstance(node, ast.Assign) and is_literal else ""
-    own = text.split("\n") if text else plain
+    own = laid_out(source, before=f"{name} = ")
+    found = assignment_of(name, names, file)
+    if found is None:
+        return Constant(source, tuple(own))
+    node, lines, cell = found
+    given = node.value or ast.Constant(None)
+    is_alone = isinstance(node, ast.AnnAssign) or [*map(type, getattr(node, "targets", ()))] == [ast.Name]
+    written = literal_value(given) if is_alone else UNKNOWN
+    if not is_alone or (written is not UNKNOWN and not is_same_data(written, value)):
+        return Constant(source, tuple(own), (cell, node.lineno))
+    behind = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+    beside = behind if behind.startswith("#") else ""
     computed = f"# {ast.unparse(given)} in the notebook"
-    if is_computed and not beside and len(computed) <= LINE:
-        beside = "" if ast.unparse(ast.parse("\n".join(plain))).endswith(f"= {ast.unparse(given)}") else computed
-    if beside and (text or len(own) == 1) and len(f"{own[-1]}  {beside}") <= LINE:
-        return [*above, *own[:-1], f"{own[-1]}  {beside}"]
-    return [*above, *([beside] if beside else []), *own]
+    is_source = written is not UNKNOWN and isinstance(node, ast.Assign)
+    if is_source:
+        own = (ast.get_source_segment("\n".join(lines), node) or "").split("\n")
+    elif written is UNKNOWN and (is_data(value) or is_plain_array(value)) and len(computed) <= LINE:
+        beside = beside or ("" if ast.unparse(ast.parse(source)) == ast.unparse(given) else computed)
+    above, together = comment_above(lines, node.lineno), f"{own[-1]}  {beside}"
+    if beside and (is_source or len(own) == 1) and len(together) <= LINE:
+        own[-1] = together
+    elif beside:
+        above.append(beside)
+    return Constant(source, (*above, *own), (cell, node.lineno))
 
 
 # -- meanings and values ----------------------------------------------------------------------------------------------
@@ -478,16 +490,6 @@ def _position(found: Definition) -> Position:
     return cell_of(found.file, found.names), found.line
 
 
-def _owner_of(function: Any) -> Any:
-    """Return what a method is of, if that is a class, or a literal that the method does not change; else UNKNOWN."""
-    if isinstance(function, types.MethodDescriptorType | types.WrapperDescriptorType | types.ClassMethodDescriptorType):
-        return function.__objclass__
-    name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
-    if not isinstance(function, types.MethodType | types.BuiltinMethodType) or getattr(owner, name, None) != function:
-        return UNKNOWN
-    return owner if isinstance(owner, type) or (name not in CHANGING and literal_source(owner)) else UNKNOWN
-
-
 def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
     """Whether the text of a default makes its value: a literal, or a name that means the same by now."""
     if isinstance(default, ast.Name) or (isinstance(default, ast.Attribute) and type(value) not in (list, dict, set)):
@@ -495,50 +497,8 @@ def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
     return is_same_data(literal_value(default), value)
 
 
-def _way_out(value: Any, name: str) -> str:
-    """Return what to do about a value that no expression makes again."""
-    place = "at module level of a module that is imported"
-    if is_data(value) or is_plain_array(value):
-        return f"Make {name} a token, make it inside the function, or {place}"
-    return f"Make {name} inside the function, or {place}"
-
-
-def _home_of_data(value: Any) -> Importable | None:
-    """Return the name under which an installed module has a container, such as a table that is too long for text."""
-    if type(value) not in (list, dict, set, tuple):
-        return None
-    modules = [(name, module) for name, module in list(sys.modules.items()) if name != "__main__" and "._" not in name]
-    found = (
-        Importable(name, known)
-        for name, module in modules
-        for known, other in list(getattr(module, "__dict__", {}).items())
-        if other is value and not name.startswith("_")
-    )
-    return next(found, None)
-
-
-def _check_imports(found: Definition, what: str) -> None:
-    """Refuse a definition that imports the notebook itself."""
-    for node in ast.walk(found.node):
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            modules = [getattr(node, "module", ""), *(alias.name for alias in node.names)]
-            if "__main__" in modules:
-                text = f"{what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
-                raise Refused(f"{text}. Use what it has by its own name, without the module.")
-
-
-def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
-    """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
-    found: dict[str, None] = {}
-    for node in ast.walk(tree):
-        chain = dotted_name(node)
-        reached: Any = module
-        dotted = name
-        for part in chain[1:] if chain[:1] == (name,) else ():
-            reached = getattr(reached, part, None)
-            if not isinstance(reached, types.ModuleType) or reached.__name__ != f"{dotted}.{part}":
-                break
-            dotted = f"{dotted}.{part}"
-        if dotted != name:
-            found[dotted] = None
-    return tuple(found)
+def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> list[str]:
+    """Return the modules that are reached as attributes of one that is called by its own name."""
+    dotted = {ast.unparse(node): node for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    reached = {text: evaluated(node, {name: module}) for text, node in dotted.items() if text in sys.modules}
+    return [text for text, found in reached.items() if found is sys.modules[text]]

@@ -238,6 +238,10 @@ REFUSED: dict[str, tuple[str, str, str]] = {
         "def d(g):\n    seen = {}\n    @functools.wraps(g)\n    def w(a):\n        seen.setdefault('first', g(a))\n        return a - seen['first']\n"
         "    return w\n@d\ndef f(a):\n    return a", "f", r"@d \(cell \[1\], line 8\): 'w' writes into 'seen', .*\(cell \[1\], line 5\)",
     ),
+    "decorator that registers": (
+        "REG = {}\ndef register(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(a)\n    REG[g.__name__] = w\n    return w\n"
+        "@register\ndef f(a):\n    return a", "f", r"@register \(cell \[1\], line 8\): 'register' writes into 'REG', .*\(cell \[1\], line 6\)",
+    ),
     "decorator with a default that was changed": (
         "N = 2\ndef d(g):\n    @functools.wraps(g)\n    def w(a, n=N):\n        return g(a) * n\n    return w\n@d\ndef f(a):\n    return a\nN = 3", "f",
         r"'f' \(cell \[1\], line 7\): its default of 'n' is 2 in the notebook and 3",

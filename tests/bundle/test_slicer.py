@@ -99,6 +99,14 @@ SLICED = {
         "import keyword\ndef f(x, k=keyword.softkwlist):\n    return x + isinstance(k, list)\n",
         4,
     ),
+    "method of a library's class under a name": (
+        "total = np.ndarray.sum\ndef f(x):\n    return total(np.ones(x))\n",
+        3.0,
+    ),
+    "table of a module that is too long for text": (
+        "from keyword import kwlist\nfrom token import tok_name\ndef f(x):\n    return kwlist[0], tok_name[x]\n",
+        ("False", "STRING"),
+    ),
     "type as default": ("def f(x, kind=np.uint8):\n    return kind(x).itemsize\n", 1),
     "unguarded": ("@ep.unguarded\ndef f(x):\n    return x\n", 3),
     "redefinition": ("def f(x):\n    return 0\ndef f(x):\n    return x\n", 3),

@@ -149,6 +149,14 @@ def test_a_default_that_was_changed_since_is_written_as_it_is(value):
         written(function)
 
 
+@pytest.mark.parametrize("given", ["def f(x, *, k=K):\n    return x * k", "f = lambda x, k=K: x * k"])
+def test_a_default_keeps_its_value_when_its_name_has_another_by_now(given):
+    text = written(notebook(f"K = 5\n{given}\nK = 9\n")["f"])
+    assert "k=5)" in text
+    assert "K = " not in text
+    assert executed(text)(2) == 10
+
+
 def test_a_default_that_was_filled_since_is_written_as_it_is():
     function = notebook("def f(x, k=[]):\n    k.append(x)\n    return k\n")["f"]
     assert executed(written(function))(1) == [1]
