@@ -433,6 +433,7 @@ _ATTRIBUTES: Final[Mapping[type, tuple[str, ...]]] = {
     functools.partial: ("func", "args", "keywords"),
     types.MethodType: ("__func__", "__self__"),
     property: ("fget", "fset", "fdel"),
+    functools.cached_property: ("func", "attrname"),
     staticmethod: ("__func__",),
     classmethod: ("__func__",),
     dataclasses.Field: (

@@ -174,7 +174,6 @@ class Database:
                 "%s was deleted, moved or replaced while it was open. Later rows are written to the file of that name."
             )
             _log.warning(text, self.place)
-            self.engine.dispose()
             self._identity = None
         is_new = self._identity is None
         with self.engine.begin() as connection:
@@ -259,8 +258,11 @@ def connect_options(url: sa.URL) -> dict[str, Any]:
 def _create_engine(url: sa.URL) -> sa.Engine:
     """Return what connects to a database; no connection is made yet."""
     try:
-        # Pinged, so that a server that was restarted is found again.
-        engine = sa.create_engine(url, connect_args=connect_options(url), hide_parameters=True, pool_pre_ping=True)
+        # A file is opened for each transaction: it may be another one by then. Servers are pinged: they may be restarted.
+        pool = sa.NullPool if url.get_backend_name() == "sqlite" else None
+        engine = sa.create_engine(
+            url, connect_args=connect_options(url), hide_parameters=True, pool_pre_ping=True, poolclass=pool
+        )
     except (NoSuchModuleError, ImportError, ArgumentError) as error:
         kind, driver = url.get_backend_name(), url.drivername.partition("+")[2]
         way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
