@@ -258,8 +258,8 @@ def connect_options(url: sa.URL) -> dict[str, Any]:
 def _create_engine(url: sa.URL) -> sa.Engine:
     """Return what connects to a database; no connection is made yet."""
     try:
-        # A file is opened for each transaction, since it may be another one by then. A server is pinged: it may have been
-        # restarted.
+        # A file is opened for each transaction, since it may be another one by then.
+        # A server is pinged: it may have been restarted.
         pool = sa.NullPool if url.get_backend_name() == "sqlite" else None
         engine = sa.create_engine(
             url, connect_args=connect_options(url), hide_parameters=True, pool_pre_ping=True, poolclass=pool
