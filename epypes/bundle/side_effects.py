@@ -139,12 +139,20 @@ def check_patches(found: Definition) -> None:
     for owner, name in _read_by(found):
         if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
             owner, name = of_classes.get(name, (None, name))
-        place = known.get((owner, name), "")
+        place = known.get((owner, name), "") or (found.place_in(found.node) if _is_patched(owner, name) else "")
         if place:
             spelled = name if owner is builtins else f"{owner.__name__}.{name}"
             text = f"{found.what} uses {spelled!r}, which the notebook has changed ({place})"
             way_out = "Call yours by a name of its own, or make the value a token."
             raise Refused(f"{text}; a service has it as it was installed. {way_out}")
+
+
+def _is_patched(owner: Any, name: str) -> bool:
+    """Whether a module has a function, class or mock of the notebook, in whatever way that was put there."""
+    value = vars(owner).get(name) if isinstance(owner, types.ModuleType) and owner.__name__ != "__main__" else None
+    is_own = isinstance(value, types.FunctionType) and value.__globals__.get("__name__") == "__main__"
+    homes = (getattr(value, "__module__", ""), type(value).__module__)
+    return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
 
 
 def _patches() -> dict[tuple[Any, str], str]:

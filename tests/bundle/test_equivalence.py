@@ -145,6 +145,18 @@ REFUSED: dict[str, tuple[str, str]] = {
     "name that was added to a module and is read by getattr": (
         "import math\nmath.gain = 3\ndef f(a):\n    return a * getattr(math, 'gain', 1)", "uses 'math.gain', which the notebook has changed",
     ),
+    "function that was put into a module by a name that no text says": (
+        "import math\nsetattr(math, 'ha' + 'lf', lambda a: a / 2)\ndef f(a):\n    return math.half(a)",
+        r"uses 'math.half', which the notebook has changed \(cell \[1\], line 3\)",
+    ),
+    "function that was put into the names of a module": (
+        "import math\nvars(math)['third'] = lambda a: a / 3\ndef f(a):\n    return math.third(a)", "uses 'math.third', which the notebook has changed",
+    ),
+    "mock in a module": (
+        "import math\nfrom unittest import mock\nmock.patch.object(math, 'quarter', create=True).start()\n"
+        "def f(a):\n    return math.quarter(a) if a is None else a",
+        "uses 'math.quarter', which the notebook has changed",
+    ),
     "list that holds itself": (
         "X = [1]\nX.append(X)\ndef f(a):\n    return a * X[0]", r"uses 'X' from it, of type list\. Make X a token",
     ),
