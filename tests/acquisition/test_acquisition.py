@@ -290,7 +290,7 @@ def test_a_stream_that_breaks_off_is_opened_again(tmp_path):
 def test_a_video_without_loop_ends(tmp_path):
     images = [gray(1), gray(2), gray(3)]
     with ep.ImageAcquisition(ep.camera(images, fps=math.inf, loop=False), gray(9)) as acquisition:
-        until(lambda: acquisition.states == ("ended", "running"))
+        until(lambda: acquisition.states == ("ended", "running") and acquisition.counts[1].frames)
         assert acquisition.counts[0] == Counts(frames=3, missed=0, failed=0)
         assert newest(acquisition)[0].number == 3
     assert acquisition.states == ("ended", "stopped")
