@@ -77,7 +77,7 @@ def promote(
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_folder(target) as draft:
             _write(draft, target, runner_or_pipeline, ports, outputs, samples)
-            on_progress("replaying in a fresh process")
+            on_progress("replaying in fresh processes")
             for note in prove(draft, target).notes:
                 on_progress(note)
             _replace(draft, target)

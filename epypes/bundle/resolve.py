@@ -221,7 +221,8 @@ def function_definition(function: Any, what: str) -> Definition:
         lines, nodes = lambdas_of(code)
         node = _as_function(nodes[0]) if len(nodes) == 1 else None
     if not lines:
-        way_out = "Define it in a cell without %%time, or in a module that is installed."
+        way_out = "Define it in a cell without %%time, in a file, or in a module that is installed"
+        way_out += ": Python keeps no text of what is typed at a prompt."
         raise Refused(f"{what} has no source ({place}). {way_out}")
     if node is None:
         text = f"{what} is not what its source says ({place}): that was changed since it was run, or the function was."

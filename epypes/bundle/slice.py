@@ -306,8 +306,13 @@ class Slice:
         source = expression(self, value, what, wanted)
         if source and (is_short(source) or callable(value)):
             return source
-        token = "a token, make it " if is_data(value) or is_plain_array(value) else ""
-        raise Refused(f"{reason}. Make {name} {token}inside the function, or in a module that is imported.")
+        place = "inside the function, or in a module that is imported"
+        way_out = f"Make {name} {place}"
+        if is_data(value) or is_plain_array(value):
+            way_out = f"Make {name} a token, make it {place}"
+        elif type(value).__module__ == "__main__":
+            way_out += ", or make its class a dataclass"
+        raise Refused(f"{reason}. {way_out}.")
 
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
         """Write a definition, after what it reads from outside but for the names that are its own."""

@@ -30,10 +30,10 @@ _MAX_ROWS: Final = 100
 def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: Sequence[str]) -> None:
     """Write the graph of a notebook as a bundle, and verify it.
 
-    The notebook is executed in a new kernel. The bundle is replayed in a fresh process, and must compute the same.
+    The notebook is executed in a new kernel. The bundle is replayed in fresh processes, and must compute the same.
     """
     run_promotion(notebook, to, name, output, sample)
-    click.echo(f"Promoted {name!r} of {notebook} to {to}: replayed identical in a fresh process.")
+    click.echo(f"Promoted {name!r} of {notebook} to {to}: replayed identical in fresh processes.")
 
 
 def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], samples: Sequence[str] = ()) -> None:

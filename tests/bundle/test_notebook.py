@@ -33,7 +33,7 @@ def test_the_caller_gets_the_progress_of_cells_and_of_the_promotion(tmp_path):
     )
     assert verify(tmp_path / "b").identical
     assert cells[:3] == [(1, 3), (2, 3), (3, 3)]
-    assert "replaying in a fresh process" in steps
+    assert "replaying in fresh processes" in steps
 
 
 @pytest.mark.notebook
