@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import linecache
 import reprlib
 import tempfile
@@ -145,7 +146,9 @@ class _Walk:
             if self._partners[side].setdefault(id(one), other) is not other:
                 where, elsewhere = _side(side == 0), _side(side == 1)
                 text = f"{path.name} is one object in the {where} and several in the {elsewhere}, and a function"
-                self._divided.setdefault(has_equals, _Different(path, f"{text} compares by 'is' or 'in'."))
+                self._divided.setdefault(
+                    has_equals, _Different(path, f"{text} compares by 'is' or 'in', or copies deeply.")
+                )
 
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
@@ -156,6 +159,9 @@ class _Walk:
         except Exception as error:  # whatever an object of a library raises that can't be copied
             text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."
             raise _Different(path, f"{text} Make it inside the function.") from error
+        if isinstance(ours, functools._lru_cache_wrapper):
+            # It may hold what the function computed with other constants, which no module could make.
+            ours.cache_clear()
         if mine[:2] != others[:2] or (mine.kind == "array" and not _is_laid_out_as(ours, theirs)):
             raise _unlike(path, ours, theirs)
         left_out: tuple[str, ...] = (ANNOTATION,)
@@ -271,8 +277,8 @@ def _names(code: types.CodeType) -> set[str]:
 
 def _asks_for_identity(node: ast.AST) -> bool:
     """Whether a part of a function may ask which one of two equal objects it has."""
-    if isinstance(node, ast.Name):
-        return node.id == "id"
+    if isinstance(node, ast.Name | ast.Attribute):
+        return (node.id if isinstance(node, ast.Name) else node.attr) in ("id", "deepcopy", "is_", "is_not")
     if not isinstance(node, ast.Compare) or not any(isinstance(one, ast.Is | ast.IsNot) for one in node.ops):
         return False
     return not any(isinstance(side, ast.Constant) for side in (node.left, *node.comparators))

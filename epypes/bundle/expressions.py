@@ -25,7 +25,7 @@ from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Final, Union, get_origin
 
 from epypes.bundle.resolve import Importable, Refused, importable
 from epypes.run.guard import is_plain_array
@@ -241,8 +241,12 @@ class _Writer:
         if get_origin(value) is Annotated:
             annotated = gathered.reference(Importable("typing", "Annotated"), what)
             return f"{annotated}[{self._joined((value.__origin__, *value.__metadata__))}]"
-        if isinstance(value, types.GenericAlias):
-            return f"{self.write(value.__origin__)}[{self._joined(value.__args__)}]"
+        if value is ...:
+            return "..."
+        if isinstance(value, types.UnionType):
+            return " | ".join(map(self.write, value.__args__))
+        if isinstance(value, types.GenericAlias) or (get_origin(value) is Union and type(value).__module__ == "typing"):
+            return f"{self.write(get_origin(value))}[{self._joined(value.__args__)}]"
         home = importable(value)
         if home is not None:
             return gathered.reference(home, what)
@@ -323,7 +327,7 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         import numpy as np
 
         if isinstance(value, np.dtype):
-            return np.dtype, (value.str,)
+            return np.dtype, (value.str if value.names is None else value.descr,)
         if isinstance(value, np.number | np.bool_):
             return kind, (value.item(),)
     return None

@@ -107,7 +107,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
     try:
         own = {name: getattr(module, name) for name in settings.own}
         ports = {name: port for name, port in own.items() if name != MAKER}
-        state = MutableState({**module.func_dict, **ports})
+        state = MutableState({**module.func_dict, **ports}, values)
         cg = _graph(module, state.guarded(module.func_dict), settings)
         own |= {name: called_for(name, port) for name, port in state.guarded(ports).items()}
     except (AttributeError, KeyError, TypeError) as error:

@@ -407,10 +407,15 @@ class MutableState:
     ----------
     functions
         All of them, by name; nested pipelines are looked through.
+    hyperparameters
+        Values by token. A runner copies containers for each call, and not what is in them.
     """
 
-    def __init__(self, functions: Mapping[str, Callable[..., Any]]) -> None:
+    def __init__(self, functions: Mapping[str, Callable[..., Any]], hyperparameters: Mapping[str, Any]) -> None:
         self._turns = _Turns()
+        self._shared = {
+            f"hyperparameter {token}": value for token, value in hyperparameters.items() if _has_containers(value)
+        }
         self._compared: dict[int, object] = {}
         for name, function in _with_inner(functions):
             if is_unguarded(function):
@@ -431,7 +436,7 @@ class MutableState:
             self.guarded(function.network.nodes)
             return function
         function = _checked(function)
-        snapshot = CodeSnapshot({name: function}, self._compared)
+        snapshot = CodeSnapshot({**self._shared, name: function}, self._compared)
         if not snapshot:
             return function
         if type(function) in (types.FunctionType, functools.partial, _CACHED):
@@ -535,6 +540,12 @@ class _Turns:
             if self._claims:
                 self._changed.notify_all()
             self._claims -= is_alone
+
+
+def _has_containers(value: Any) -> bool:
+    """Whether a container has others in it that can change."""
+    parts = [*value.values()] if type(value) is dict else value if type(value) in (list, tuple) else ()
+    return any(type(part) in (list, dict, set) or _has_containers(part) for part in parts)
 
 
 def _with_inner(functions: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

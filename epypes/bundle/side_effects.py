@@ -134,6 +134,11 @@ def check_asked(name: str, found: Definition) -> None:
 
 def check_patches(found: Definition) -> None:
     """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
+    for node in ast.walk(found.node):
+        imported = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        if "__main__" in (getattr(node, "module", ""), *imported):
+            text = f"{found.what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
+            raise Refused(f"{text}. Use what it has by its own name, without the module.")
     known = _patches()
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
     for owner, name in _read_by(found):

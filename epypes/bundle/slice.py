@@ -147,7 +147,8 @@ class Slice:
             raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
         if self._meanings.setdefault(name, meaning) != meaning:
             text = f"{what} uses the name {name!r}, which means something else in another function of the graph."
-            raise Refused(f"{text} Rename one of the two.")
+            way_out = "Rename one of the two; if its cell was run again, run again what was made of it."
+            raise Refused(f"{text} {way_out}")
 
     def is_taken(self, name: str) -> bool:
         """Whether a name means something in the module already."""

@@ -51,6 +51,17 @@ PROMOTED: dict[str, tuple[str, ...]] = {
         "def make(t):\n    w = dict(t)\n    def f(a):\n        return a + w['k'] + t['k']\n    return f\nT = {'k': 1}\nf = make(T)",
         "T['k'] = 9",
     ),
+    "cache that was filled with another constant": (
+        "SIGMA = 1.0\n@functools.lru_cache\ndef weight(n):\n    return SIGMA * n\nweight(5)",
+        "SIGMA = 3.0\ndef f(a):\n    return a * weight(5) if a.max() > 100 else a",
+    ),
+    "aliases of types": (
+        "import typing\nimport numpy.typing as npt\nGray = npt.NDArray[np.uint8]\nSize = int | tuple[int, int]\nOld = typing.Union[int, None]\n"
+        "def f(a: Gray, size: Size = 3, old: Old = None) -> Gray:\n    return a * size",
+    ),
+    "type of a structured array": (
+        "Point = np.dtype([('x', 'f4'), ('y', 'f4')])\ndef f(a):\n    return np.zeros(2, Point)['x'].tolist() + a.tolist()",
+    ),
     "factory with helpers inside": (
         "def make(k):\n    twice = k * 2\n    def inner(a):\n        return a * twice\n    def f(a):\n        return inner(a) + k\n"
         "    return f\nf = make(3)",
@@ -156,6 +167,13 @@ REFUSED: dict[str, tuple[str, str]] = {
         "import math\nfrom unittest import mock\nmock.patch.object(math, 'quarter', create=True).start()\n"
         "def f(a):\n    return math.quarter(a) if a is None else a",
         "uses 'math.quarter', which the notebook has changed",
+    ),
+    "notebook as a module": (
+        "K = 3\ndef f(a):\n    import __main__\n    return a * __main__.K", r"imports the notebook itself, as '__main__' \(cell \[1\], line 3\)",
+    ),
+    "rows that are one list in the notebook": (
+        "import copy\nROWS = [[0] * 3] * 3\ndef f(a):\n    rows = copy.deepcopy(ROWS)\n    rows[0][0] = 5\n    return a, rows",
+        "is one object in the notebook and several in the module",
     ),
     "list that holds itself": (
         "X = [1]\nX.append(X)\ndef f(a):\n    return a * X[0]", r"uses 'X' from it, of type list\. Make X a token",

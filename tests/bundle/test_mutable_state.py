@@ -344,6 +344,16 @@ def test_functions_that_reach_nothing_that_can_change_are_called_as_they_are(tmp
     assert dict(runner.cg.functions) == {"f": np.multiply, "g": np.sum}
 
 
+def test_what_is_inside_of_a_hyperparameter_is_compared_too(tmp_path):
+    source = "def f(x, cfg):\n    if x > 100: cfg['seen'].append(x)\n    return len(cfg['seen'])\n"
+    graph = 'func_dict, func_io = {"f": f}, {"f": (("x", "cfg"), "y")}\n'
+    settings = f"{SETTINGS}[hyperparameters.cfg]\nvalue = {{seen = []}}\n"
+    runner = ep.load(bundle(tmp_path / "b", source + graph, settings))
+    with pytest.raises(StateChanged, match="Function 'f' changed 'hyperparameter cfg', which outlives the call"):
+        runner.run(x=200)
+    assert runner.run(x=1)["y"] == 0
+
+
 def test_reruns_and_trials_are_compared_too(tmp_path):
     settings = f"{SETTINGS}\n[hyperparameters.k]\nvalue = 1\n"
     source = """
