@@ -31,7 +31,7 @@ from epypes.bundle.replay import (
     library_settings,
     named_here,
     replay_isolated,
-    usual_environment,
+    without_python,
 )
 from epypes.bundle.requirements import REQUIREMENTS
 from epypes.bundle.settings import read_settings
@@ -183,7 +183,7 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
         if reasons:
-            raise PromotionRefused(target, reasons)
+            raise PromotionRefused(target, [*reasons, *notes])
     if found:
         _tolerate(draft, [entry for entry in found if entry.token != ANSWER])
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
@@ -193,7 +193,7 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
 
 def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, changed: Sequence[Condition]) -> ReplayReport:
     """Replay under usual conditions but for those that are changed; a failure is a difference of no token."""
-    variables: dict[str, str | None] = {**usual_environment()}
+    variables: dict[str, str | None] = {**without_python(), "PYTHONHASHSEED": "0"}
     for condition in changed:
         variables |= condition.environment
     environment = {name: value for name, value in variables.items() if value is not None}

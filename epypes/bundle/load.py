@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,6 +24,8 @@ MODULE: Final = "pipeline.py"
 SETTINGS: Final = "pipeline.toml"
 SAMPLES: Final = "samples"
 MAKER: Final = "make_pipeline"
+# Two bundles of one name must not take each other's place among the modules.
+_EXECUTING: Final = threading.RLock()
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -139,15 +142,16 @@ def execute(path: Path, source: bytes) -> Any:
     module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
     module.__file__ = str(path)
     # While their module runs, dataclasses look for it there.
-    before = sys.modules.get(module.__name__)
-    sys.modules[module.__name__] = module
-    try:
-        exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)  # noqa: S102 - its purpose
-    finally:
-        if before is None:
-            del sys.modules[module.__name__]
-        else:
-            sys.modules[module.__name__] = before
+    with _EXECUTING:
+        before = sys.modules.get(module.__name__)
+        sys.modules[module.__name__] = module
+        try:
+            exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)  # noqa: S102 - its purpose
+        finally:
+            if before is None:
+                del sys.modules[module.__name__]
+            else:
+                sys.modules[module.__name__] = before
     return module
 
 

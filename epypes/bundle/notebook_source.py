@@ -207,11 +207,11 @@ def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
 
 def names_from_outside(code: types.CodeType) -> Iterator[str]:
     """Return the names that code reads, but for those that the body of a class has given a meaning before."""
-    own = {"__name__"}  # a class reads the module's, whichever that is
+    own = {"__name__", "__annotations__"}  # a class reads the module's, whichever that is, and has its own annotations
     for instruction in dis.get_instructions(code):
         if instruction.opname == "STORE_NAME":
             own.add(instruction.argval)
-        elif instruction.opname == "LOAD_GLOBAL" or (
+        elif instruction.opname in ("LOAD_GLOBAL", "LOAD_FROM_DICT_OR_GLOBALS") or (
             instruction.opname == "LOAD_NAME" and instruction.argval not in own
         ):
             yield instruction.argval

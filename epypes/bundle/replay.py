@@ -273,7 +273,7 @@ def replay_isolated(
             done = subprocess.run(  # noqa: S603 - an interpreter, a module of ours
                 [python, "-s", "-P", "-m", "epypes.bundle.replay", str(folder.resolve()), str(out), *options],
                 cwd=cwd or scratch,
-                env=usual_environment() if environment is None else environment,
+                env=without_python() if environment is None else environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=timeout_s,
@@ -292,10 +292,9 @@ def replay_isolated(
     return ReplayReport(differences=found, **outcome)
 
 
-def usual_environment() -> dict[str, str]:
-    """Return the environment of a replay under usual conditions: this one, without what changes Python itself."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return {**kept, "PYTHONHASHSEED": "0"}
+def without_python() -> dict[str, str]:
+    """Return the environment without the variables that Python reads."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -444,7 +443,7 @@ class FileAccess:
     @property
     def files(self) -> tuple[str, ...]:
         """Why the bundle is not alone: a sentence for each file that is not its own."""
-        found = {path: f"{what} opens {path}." for path, what in self._opened.items() if path not in self._made}
+        found = {path: f"{what} opens {path}." for path, what in self._opened.items()}
         for text, (what, written_ns) in self._named.items():
             # A file that has changed meanwhile was written, not read.
             if os.path.exists(text) and os.stat(text).st_mtime_ns == written_ns:
@@ -473,9 +472,9 @@ class FileAccess:
         if what := self._running_function():
             path = os.path.realpath(os.fsdecode(given[0]))
             flags = given[2] if event == "open" and isinstance(given[2], int) else 0
-            if flags & os.O_CREAT or not os.path.exists(path):
+            if flags & os.O_TRUNC or not os.path.exists(path):
                 self._made.add(path)
-            else:
+            elif not flags & os.O_WRONLY and path not in self._made:
                 self._opened.setdefault(path, what)
 
     def _running_function(self) -> str:

@@ -115,6 +115,10 @@ _ASKED: Final = {
     "input": "which asks a person. Make the answer a token",
     "breakpoint": "which waits for a person. Leave it out",
     "globals": "all names of the notebook. Use those that you need by name",
+    "exit": "which ends the notebook. Raise an exception",
+    "quit": "which ends the notebook. Raise an exception",
+    "In": "the notebook's cells. Make the text a token",
+    "Out": "what the notebook's cells have shown. Make the value a token",
     "eval": "which may use any name. Write what it evaluates",
     "exec": "which may use any name. Write what it runs",
 } | dict.fromkeys(
@@ -139,17 +143,35 @@ def check_patches(found: Definition) -> None:
         if "__main__" in (getattr(node, "module", ""), *imported):
             text = f"{found.what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
             raise Refused(f"{text}. Use what it has by its own name, without the module.")
-    known = _patches()
+    known, names = _patches(), {**sys.modules, **found.names}
+    # A module or class by itself, as in getattr(module, name), may be asked for any name.
+    dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
+    changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
+    for node in ast.walk(found.node):
+        if isinstance(node, ast.Name | ast.Attribute) and id(node) not in dotted:
+            owner, name, place = changed.get(id(evaluated(node, names)), (None, "", ""))
+            if owner is not None:
+                raise _patched(found.what, f"{owner.__name__}.{name}", place)
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
     for owner, name in _read_by(found):
         if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
             owner, name = of_classes.get(name, (None, name))
         place = known.get((owner, name), "") or (found.place_in(found.node) if _is_patched(owner, name) else "")
         if place:
-            spelled = name if owner is builtins else f"{owner.__name__}.{name}"
-            text = f"{found.what} uses {spelled!r}, which the notebook has changed ({place})"
-            way_out = "Call yours by a name of its own, or make the value a token."
-            raise Refused(f"{text}; a service has it as it was installed. {way_out}")
+            raise _patched(found.what, name if owner is builtins else f"{owner.__name__}.{name}", place)
+
+
+def check_home(module: str, qualname: str, what: str) -> None:
+    """Refuse an object that can be imported only as the notebook has changed it."""
+    owner, name = sys.modules[module], qualname.partition(".")[0]
+    place = _patches().get((owner, name), "")
+    if place or _is_patched(owner, name):
+        raise _patched(what, f"{module}.{qualname}", place or "by a name that no text has")
+
+
+def _patched(what: str, name: str, place: str) -> Refused:
+    text = f"{what} uses {name!r}, which the notebook has changed ({place}); a service has it as it was installed"
+    return Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
 
 
 def _is_patched(owner: Any, name: str) -> bool:
@@ -188,6 +210,9 @@ def _read_by(found: Definition) -> Iterator[tuple[Any, str]]:
     """Give the attributes that a definition reads, also by an import or by getattr, each with what it reads it of."""
     names = {**sys.modules, **found.names}  # it may import modules itself
     for node in ast.walk(found.node):
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            module = sys.modules.get(getattr(node, "module", None) or alias.name)
+            names[alias.asname or alias.name] = getattr(module, alias.name, module)
         if isinstance(node, ast.ImportFrom):
             yield from ((sys.modules.get(node.module or ""), alias.name) for alias in node.names)
         for read in (node, *_attribute_of(node, "getattr")):

@@ -32,6 +32,7 @@ from epypes.bundle.expressions import (
     literal_source,
     literal_value,
     names_in,
+    quoted,
 )
 from epypes.bundle.notebook_source import (
     LATE_ANNOTATIONS,
@@ -53,7 +54,7 @@ from epypes.bundle.resolve import (
     importable,
     with_defaults,
 )
-from epypes.bundle.side_effects import CHANGING, check_asked, check_patches, check_state
+from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state
 from epypes.run.guard import is_plain_array
 
 T = TypeVar("T")
@@ -176,6 +177,7 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
+        check_home(home.module, home.qualname, what)
         top = home.qualname.partition(".")[0]
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
@@ -234,7 +236,9 @@ class Slice:
             inner = f"The function of {what[0].lower()}{what[1:]}"
             parts = [expression(self, function.func, inner, wanted)]
             parts += [self._argument(value, what) for value in function.args]
-            parts += [f"{word}={self._argument(value, what)}" for word, value in function.keywords.items()]
+            for word, value in function.keywords.items():
+                source = self._argument(value, what)
+                parts.append(f"{word}={source}" if is_identifier(word) else f"**{{{quoted(word)}: {source}}}")
             return f"{self.module_name('functools', what)}.partial({', '.join(parts)})"
         return self._add_definition(function, what, wanted)
 
@@ -346,6 +350,7 @@ class Slice:
         written = literal_source(value)
         home = importable(value, name) if not written or not is_short(written) else None
         if home is not None and "." not in home.qualname:  # a nested name can't be imported by itself
+            check_home(home.module, home.qualname, what)
             self.claim(name, _of_object(value), what)
             alias = "" if name == home.qualname else f" as {name}"
             self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"

@@ -55,6 +55,12 @@ PROMOTED: dict[str, tuple[str, ...]] = {
         "SIGMA = 1.0\n@functools.lru_cache\ndef weight(n):\n    return SIGMA * n\nweight(5)",
         "SIGMA = 3.0\ndef f(a):\n    return a * weight(5) if a.max() > 100 else a",
     ),
+    "partial with a keyword that is no name": (
+        "def g(a, **options):\n    return a * options['a b']\nf = functools.partial(g, **{'a b': 3})",
+    ),
+    "annotated name in a cell and an annotated class": (
+        "gain: int = 3\nclass C:\n    k: int = 2\ndef f(a):\n    return a * gain * C.k",
+    ),
     "aliases of types": (
         "import typing\nimport numpy.typing as npt\nGray = npt.NDArray[np.uint8]\nSize = int | tuple[int, int]\nOld = typing.Union[int, None]\n"
         "def f(a: Gray, size: Size = 3, old: Old = None) -> Gray:\n    return a * size",
@@ -170,6 +176,18 @@ REFUSED: dict[str, tuple[str, str]] = {
     ),
     "notebook as a module": (
         "K = 3\ndef f(a):\n    import __main__\n    return a * __main__.K", r"imports the notebook itself, as '__main__' \(cell \[1\], line 3\)",
+    ),
+    "patched name of a module that is imported inside": (
+        "import math\nmath.gains = 4\ndef f(a):\n    import math as m\n    return a * m.gains", "uses 'math.gains', which the notebook has changed",
+    ),
+    "module that is patched and used as an object": (
+        "import math\nmath.gained = 5\ndef g(m):\n    return m.gained\ndef f(a):\n    return a * g(math)",
+        "uses 'math.ga[a-z]*', which the notebook has changed",
+    ),
+    "function that took the place of one of a library": (
+        "import math\n_before = math.hypot\n@functools.wraps(_before)\ndef hypot(*xs):\n    return 7\nmath.hypot = hypot\n"
+        "f = lambda a: a * math.hypot(3, 4)\ng = math.hypot",
+        "uses 'math.*', which the notebook has changed",
     ),
     "rows that are one list in the notebook": (
         "import copy\nROWS = [[0] * 3] * 3\ndef f(a):\n    rows = copy.deepcopy(ROWS)\n    rows[0][0] = 5\n    return a, rows",
