@@ -1,4 +1,4 @@
-"""Values of hyperparameters: the axes that a sweep or a search varies, and the grids of settings made of them.
+"""Values of hyperparameters: the axes that a sweep or a search varies, and the settings made of them.
 
 A sweep and a search read ranges by one rule. Steps are counted and added in decimals, as they are written: 0.1 and two
 steps of 0.1 are 0.3, for a reader and for Optuna, which reads ranges that way too; sums of floats are
@@ -366,46 +366,25 @@ def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
 # -- grids --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Settings that are not written out yet.
-
-    Attributes
-    ----------
-    names
-        The hyperparameters that vary, in the order in which they were given.
-    size
-        How many settings there are.
-    settings
-        Returns them, each with a value for every name.
-    """
-
-    names: tuple[str, ...]
-    size: int
-    settings: Callable[[], tuple[Setting, ...]]
-
-    def require_room(self, images: int) -> None:
-        """Raise ScaleError if the settings, each on so many images, are too many to hold."""
-        if self.size * images > MOST_OUTCOMES:
-            raise too_many_outcomes(self.size, self.names, images)
+def require_room(size: int, names: Iterable[str], images: int) -> None:
+    """Raise ScaleError if the outcomes of so many settings, each on so many images, are too many to hold."""
+    if size * images > MOST_OUTCOMES:
+        each = f" on {images:,} images" if images != 1 else ""
+        raise ScaleError(
+            f"The grid has {size:,} settings of {', '.join(names)}{each}: {size * images:,} outcomes, "
+            f"and at most {MOST_OUTCOMES:,} can be held. Take fewer values, or how='random' with n=..."
+        )
 
 
-def too_many_outcomes(size: int, names: Iterable[str], images: int) -> ScaleError:
-    """Return the error of a grid whose settings, each on so many images, are too many to hold."""
-    each = f" on {images:,} images" if images != 1 else ""
-    return ScaleError(
-        f"The grid has {size:,} settings of {', '.join(names)}{each}: {size * images:,} outcomes, "
-        f"and at most {MOST_OUTCOMES:,} can be held. Take fewer values, or how='random' with n=..."
-    )
-
-
-def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0) -> Grid:
-    """Read a grid; see ``sweep``.
+def settings_of(
+    runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0, images: int = 1
+) -> tuple[Setting, ...]:
+    """Return the settings of a grid, each with a value for every hyperparameter that varies; see ``sweep``.
 
     Raises
     ------
     ScaleError
-        It does not tell which settings are meant, or is empty.
+        It does not tell which settings are meant, is empty, or has too many settings for so many images.
     UnknownName, HyperparameterError
         A name is not a hyperparameter of the runner.
     """
@@ -419,7 +398,7 @@ def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int 
             f"n={n!r} goes with how='random' or how='latin'. A {how} has as many settings as its values make."
         )
     if _is_list_of(grid, Mapping):
-        return _listed(runner, grid)
+        return _listed(runner, grid, images)
     given = dict.fromkeys(grid) if _is_list_of(grid, str) else grid
     if not isinstance(given, Mapping) or not given:
         raise ScaleError(
@@ -427,27 +406,31 @@ def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int 
         )
     for name in given:
         _require_hyperparameter(runner, name)
-    return _drawn(runner, given, how, n or 0, seed) if is_drawn else _combined(runner, given, how)
+    if is_drawn:
+        require_room(n or 0, given, images)
+        return _drawn(runner, given, how, n or 0, seed)
+    return _combined(runner, given, how, images)
 
 
 def _is_list_of(grid: Any, kind: type) -> bool:
     return isinstance(grid, list | tuple) and bool(grid) and all(isinstance(one, kind) for one in grid)
 
 
-def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
-    """Return the grid of settings that are taken as they are; what one leaves out is the runner's."""
+def _listed(runner: CompGraphRunner, grid: Sequence[Setting], images: int) -> tuple[Setting, ...]:
+    """Return settings that are taken as they are; what one leaves out is the runner's."""
     names = tuple(dict.fromkeys(name for setting in grid for name in setting))
     if not names:
         raise ScaleError("No setting of the grid names a hyperparameter. Give some, as [{'threshold': 50}, ...].")
     for name in names:
         _require_hyperparameter(runner, name)
         _require_branches(runner, name, [setting[name] for setting in grid if name in setting])
+    require_room(len(grid), names, images)
     now = {name: runner.hyperparameters[name] for name in names}
-    return Grid(names, len(grid), lambda: tuple({**now, **setting} for setting in grid))
+    return tuple({**now, **setting} for setting in grid)
 
 
-def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Grid:
-    """Return the grid of each value with each other, or of the first values of all, the second ones, and so on."""
+def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str, images: int) -> tuple[Setting, ...]:
+    """Return the settings of each value with each other, or of the first values of all, the second ones, and so on."""
     values: dict[str, Sequence[Any]] = {}
     for name, of_name in given.items():
         if isinstance(of_name, tuple):
@@ -465,32 +448,25 @@ def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Gr
             f"how='zip' takes the first values together, then the second, and so on, but {counts}. "
             "Give as many of each."
         )
-    size = max(lengths.values()) if how == "zip" else math.prod(lengths.values())
+    require_room(max(lengths.values()) if how == "zip" else math.prod(lengths.values()), values, images)
     combine: Callable[..., Iterable[tuple[Any, ...]]] = zip if how == "zip" else product
-    return Grid(
-        tuple(values), size, lambda: tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
-    )
+    return tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
 
 
-def _drawn(runner: CompGraphRunner, given: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
-    """Return the grid of settings that are drawn: at random, or by Latin hypercubes, with each n-th part once."""
+def _drawn(runner: CompGraphRunner, given: Mapping[str, Any], how: str, n: int, seed: int) -> tuple[Setting, ...]:
+    """Return settings that are drawn: at random, or by Latin hypercubes, with each n-th part once."""
+    import numpy as np
+
     axes = [axis_of(runner, name, _param(runner, name, of_name)) for name, of_name in given.items()]
-    present = runner.hyperparameters
-
-    def settings() -> tuple[Setting, ...]:
-        import numpy as np
-
-        generator = np.random.default_rng(seed)
-        if how == "random":
-            rows = generator.random((n, len(axes)))
-        else:
-            with optional_import():
-                from scipy.stats import qmc
-            rows = qmc.LatinHypercube(len(axes), seed=generator).random(n)
-        drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows.tolist())
-        return tuple(bounded(axes, setting, present) for setting in drawn)
-
-    return Grid(tuple(given), n, settings)
+    generator = np.random.default_rng(seed)
+    if how == "random":
+        rows = generator.random((n, len(axes)))
+    else:
+        with optional_import():
+            from scipy.stats import qmc
+        rows = qmc.LatinHypercube(len(axes), seed=generator).random(n)
+    drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows.tolist())
+    return tuple(bounded(axes, setting, runner.hyperparameters) for setting in drawn)
 
 
 # -- the order in which settings are run --------------------------------------------------------------------------
