@@ -17,13 +17,13 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from epypes.batch.cache import payload_digest, search_digests
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, axes_of, bounded
-from epypes.batch.items import Item, detached_runner, items_of
+from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
@@ -32,7 +32,6 @@ from epypes.bundle.fingerprint import combined_digest
 from epypes.display.durations import duration_text
 from epypes.display.markup import content, cut, cut_name, escape
 from epypes.errors import ScaleError
-from epypes.graph import CompGraph
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
@@ -321,20 +320,18 @@ def optimize(
     # A caller that sets hyperparameters meanwhile, or writes into them, does not change what is searched.
     runner = detached_runner(runner)
     axes = axes_of(runner, ranges)
-    objective = _Objective(runner.cg, metric, _cases(cases, runner), keep)
-    inputs = items_of([case.inputs for case in objective.cases], runner)
-    items = [replace(item, name=case.name or item.name) for case, item in zip(objective.cases, inputs, strict=True)]
+    objective = _Objective(runner, metric, _cases(cases, runner), keep)
     at_once = 1 if executor is None else worker_count(executor)
     with opened_store(store) as opened:
         digests, study = dict[str, str](), name or ""
         if opened is not None:
-            data = _searched_data(axes, runner.hyperparameters, objective, items)
+            data = _searched_data(axes, objective)
             digests = search_digests(runner.cg, metric, data, is_named=bool(name))
             text = repr((direction, axes, sorted(digests.items())))
             study = name or f"optimize {objective.name} {combined_digest('search', text).hex()[:12]}"
         search = _Search(axes, runner.hyperparameters, direction, seed, at_once, opened, study, digests)
         with contextlib.closing(search):
-            was_stopped = _searched(search, _Work(runner, objective, items, executor, stop), n, on_trial, progress)
+            was_stopped = _searched(search, objective, executor, stop or threading.Event(), n, on_trial, progress)
             if opened is not None:
                 search.forget_changed(search_digests(runner.cg, metric, {}, is_named=True))
     result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
@@ -345,15 +342,13 @@ def optimize(
     return result
 
 
-def _searched_data(
-    axes: Sequence[Axis], hyperparameters: Mapping[str, Any], objective: _Objective, items: Sequence[Item]
-) -> dict[str, Callable[[], Any]]:
+def _searched_data(axes: Sequence[Axis], objective: _Objective) -> dict[str, Callable[[], Any]]:
     """Return the data that decide about a trial, by what they are, for their digests."""
     choices = {axis.token: getattr(axis, "choices", None) for axis in axes}
-    fixed = {token: value for token, value in hyperparameters.items() if token not in choices}
+    fixed = {token: value for token, value in objective.runner.hyperparameters.items() if token not in choices}
     return {
         "hyperparameters": lambda: (fixed, choices),
-        "inputs of the cases": lambda: [(item.name, payload_digest(item.payload)) for item in items],
+        "inputs of the cases": lambda: [(item.name, payload_digest(item.payload)) for item in objective.items],
         "labels of the cases": lambda: [
             (case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases
         ],
@@ -369,39 +364,37 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
 
 
 def _searched(
-    search: _Search, work: _Work, n: int, on_trial: Callable[[Trial], object] | None, progress: bool | None
+    search: _Search,
+    objective: _Objective,
+    executor: Executor | None,
+    stop: threading.Event,
+    n: int,
+    on_trial: Callable[[Trial], object] | None,
+    progress: bool | None,
 ) -> bool:
     """Run the trials that are still to be run; return whether the search was stopped before its end."""
     done = search.trials
-    with progress_bar(progress, n, f"optimize {work.objective.name}", unit="trial") as advance:
+    with progress_bar(progress, n, f"optimize {objective.name}", unit="trial") as advance:
         advance(len(done), sum(trial.value is None for trial in done))
         try:
-            with contextlib.closing(_trials(search, work, n - len(done))) as coming:
+            with contextlib.closing(_trials(search, objective, executor, stop, n - len(done))) as coming:
                 for trial in coming:
                     advance(1, trial.value is None)
                     if on_trial is not None:
                         on_trial(trial)
         except KeyboardInterrupt:
             return True
-    return work.stop is not None and work.stop.is_set()
+    return stop.is_set()
 
 
-class _Work(NamedTuple):
-    """What the trials of a search run, and where."""
-
-    runner: CompGraphRunner
-    objective: _Objective
-    items: Sequence[Item]
-    executor: Executor | None
-    stop: threading.Event | None
-
-
-def _trials(search: _Search, work: _Work, count: int) -> Generator[Trial]:
+def _trials(
+    search: _Search, objective: _Objective, executor: Executor | None, stop: threading.Event, count: int
+) -> Generator[Trial]:
     """Run the next trials and yield them as they end; fewer if the search is stopped."""
     asked: dict[int, optuna.trial.Trial] = {}
     found: dict[int, dict[int, Outcome]] = {}
     # In this process each case goes on from its last run, as far as memory is for that.
-    starts = [SharedStart() if runs_here(work.executor) else None for _ in work.items]
+    starts = [SharedStart() if runs_here(executor) else None for _ in objective.items]
     held_bytes: dict[int, int] = {}
 
     def jobs() -> Iterator[Job]:
@@ -409,18 +402,18 @@ def _trials(search: _Search, work: _Work, count: int) -> Generator[Trial]:
         for number in range(count):
             asked[number], found[number] = search.ask(), {}
             setting = search.setting(asked[number].params)
-            for index, (item, case) in enumerate(zip(work.items, work.objective.cases, strict=True)):
+            for index, (item, case) in enumerate(zip(objective.items, objective.cases, strict=True)):
                 if number not in asked:  # a case before has failed
                     break
-                marked = replace(item, number=number * len(work.items) + index)
+                marked = replace(item, number=number * len(objective.items) + index)
                 own = {**setting, **(case.hyperparameters or {})}
-                yield Job(marked, (own,), keep=work.objective.keep, start=starts[index], targets=work.objective.keep)
+                yield Job(marked, (own,), keep=objective.keep, start=starts[index], targets=objective.keep)
 
-    ahead = None if work.executor is None else worker_count(work.executor)
+    ahead = None if executor is None else worker_count(executor)
     has_ended = False
-    for outcomes in run_jobs(work.runner, jobs(), work.executor, ahead=ahead, stop=work.stop):
+    for outcomes in run_jobs(objective.runner, jobs(), executor, ahead=ahead, stop=stop):
         for outcome in outcomes:
-            number, index = divmod(outcome.number, len(work.items))
+            number, index = divmod(outcome.number, len(objective.items))
             start, error = starts[index], outcome.error_info
             if start is not None and index not in held_bytes:
                 held_bytes[index] = start.nbytes
@@ -431,18 +424,18 @@ def _trials(search: _Search, work: _Work, count: int) -> Generator[Trial]:
             if error is not None and error.is_unreadable and not has_ended:
                 raise ScaleError(f"No trial can complete: {ended(error.message)} Mend the file, or leave it out.")
             found[number][index] = outcome
-            if len(found[number]) == len(work.items) or error is not None:
+            if len(found[number]) == len(objective.items) or error is not None:
                 has_ended = True
-                yield search.tell(asked.pop(number), *work.objective.score(found.pop(number)))
+                yield search.tell(asked.pop(number), *objective.score(found.pop(number)))
 
 
 class _Objective:
-    """Measures outcomes.
+    """Runs cases and measures their outcomes.
 
     Parameters
     ----------
-    cg
-        The graph.
+    runner
+        Its graph is run, with its hyperparameters where nothing varies.
     metric
         ``metric(tokens, case)`` is called with the kept tokens of a run and its case, on the thread of the caller; or
         the name of a token that is a number.
@@ -460,17 +453,19 @@ class _Objective:
     """
 
     def __init__(
-        self, cg: CompGraph, metric: ObjectiveMetric, cases: Sequence[Case], keep: Sequence[str] | None
+        self, runner: CompGraphRunner, metric: ObjectiveMetric, cases: Sequence[Case], keep: Sequence[str] | None
     ) -> None:
         if not isinstance(metric, str) and not callable(metric):
             kind = type(metric).__name__
             raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
-        self.cases = tuple(cases)
+        self.runner, self.cases = runner, tuple(cases)
+        items = items_of([case.inputs for case in cases], runner)
+        self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
         self._metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
-        self.keep = (metric,) if isinstance(metric, str) else tuple(cg.sink_tokens if keep is None else keep)
+        self.keep = (metric,) if isinstance(metric, str) else tuple(runner.cg.sink_tokens if keep is None else keep)
         for token in self.keep:
-            cg.require_token(token)
+            runner.cg.require_token(token)
 
     def score(self, outcomes: Mapping[int, Outcome]) -> tuple[float | None, str, int]:
         """Return the mean of the metric over the cases, or None and the first failure; and the time of the functions.
