@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from epypes.catalog import parameter_names, plain, range_of
 from epypes.errors import ScaleError, UnknownName
-from epypes.graph import CompGraph, as_switch
+from epypes.graph import CompGraph
 from epypes.hints import Param, as_param, odd_step, param_from_value
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
+from epypes.run.branch import branched
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -220,16 +221,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _require_branches(runner: CompGraphRunner, token: str, values: Iterable[Any]) -> None:
-    """Raise UnknownName, with the nearest name, unless the switches that a token selects have these branches."""
-    cg = runner.cg
-    for function in cg.digraph.consumers.get(token, ()):
-        switch = as_switch(cg.functions[function])
-        if switch is not None and cg.func_inputs(function)[0] == token:
-            for value in values:
-                switch.branch_index(value)
-
-
 def _token_below(runner: CompGraphRunner, token: str, name: str) -> str:
     """Return the hyperparameter that a hint calls by its own name or by that of a function's parameter."""
     if not name or name in runner.hyperparameters:
@@ -268,18 +259,16 @@ def bounded(axes: Sequence[Axis], values: Setting, present: Setting) -> dict[str
 # -- ranges as the caller gives them ------------------------------------------------------------------------------
 
 
-def _require_hyperparameter(runner: CompGraphRunner, name: Any) -> None:
-    """Raise, with the nearest name, unless a runner has this hyperparameter."""
-    known = tuple(runner.hyperparameters)
-    if name in known:
-        return
-    if name in runner.free_source_tokens:
-        raise ScaleError(f"{name!r} is a free source token, which images are given to. Freeze it, or give images=...")
-    raise UnknownName("hyperparameter", name, known)
+def _require_settable(runner: CompGraphRunner, settings: Iterable[Setting]) -> None:
+    """Raise, as the runner does, unless all these values could be set: for a wrong name, or a branch that is none."""
+    trial = branched(runner)
+    for setting in settings:
+        trial.set(**setting)
 
 
 def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
     """Return the range or the choices that are given for a hyperparameter; None stands for its hint."""
+    _require_settable(runner, [{name: runner.hyperparameters.get(name)}])
     if given is None:
         found = range_of(runner.cg, name, runner.hyperparameters[name])
         if isinstance(found, Param):
@@ -300,7 +289,7 @@ def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
         raise ScaleError(
             f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values. Write {name}=[...]."
         )
-    _require_branches(runner, name, param.choices or ())
+    _require_settable(runner, ({name: choice} for choice in param.choices or ()))
     return param
 
 
@@ -336,14 +325,12 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
         raise ScaleError(f"{text} Give some: ranges={{'name': (low, high)}}, or annotate the functions.")
     if not ranges:
         raise ScaleError('ranges is empty, so nothing would vary. Name hyperparameters: ranges={"name": (low, high)}.')
-    for token in ranges:
-        _require_hyperparameter(runner, token)
-    params = {token: _param(runner, token, ranges[token]) for token in runner.cg.source_tokens if token in ranges}
+    params = {token: _param(runner, token, given) for token, given in ranges.items()}
     for token, param in params.items():
         if param.choices is None and not _is_number(plain(present[token])):
             text = f"{token!r} is {present[token]!r:.60}, so it has no range of numbers."
             raise ScaleError(f"{text} Give a list of choices: ranges={{{token!r}: [...]}}.")
-    return tuple(axis_of(runner, token, param) for token, param in params.items())
+    return tuple(axis_of(runner, token, params[token]) for token in runner.cg.source_tokens if token in params)
 
 
 def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
@@ -386,7 +373,7 @@ def settings_of(
     ScaleError
         It does not tell which settings are meant, is empty, or has too many settings for so many images.
     UnknownName, HyperparameterError
-        A name is not a hyperparameter of the runner.
+        A name is not a hyperparameter of the runner, or a value none that the runner can have.
     """
     if how not in get_args(How):
         raise UnknownName("way to read a grid", how, get_args(How), "for how=")
@@ -404,8 +391,6 @@ def settings_of(
         raise ScaleError(
             f"grid is a mapping of hyperparameters to values, as {{'threshold': [50, 70]}}, not {grid!r:.60}."
         )
-    for name in given:
-        _require_hyperparameter(runner, name)
     if is_drawn:
         require_room(n or 0, given, images)
         return _drawn(runner, given, how, n or 0, seed)
@@ -421,9 +406,7 @@ def _listed(runner: CompGraphRunner, grid: Sequence[Setting], images: int) -> tu
     names = tuple(dict.fromkeys(name for setting in grid for name in setting))
     if not names:
         raise ScaleError("No setting of the grid names a hyperparameter. Give some, as [{'threshold': 50}, ...].")
-    for name in names:
-        _require_hyperparameter(runner, name)
-        _require_branches(runner, name, [setting[name] for setting in grid if name in setting])
+    _require_settable(runner, grid)
     require_room(len(grid), names, images)
     now = {name: runner.hyperparameters[name] for name in names}
     return tuple({**now, **setting} for setting in grid)

@@ -12,7 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.batch.grid import MOST_OUTCOMES, running_order, settings_of
-from epypes.errors import ScaleError, UnknownName
+from epypes.errors import HyperparameterError, ScaleError, UnknownName
 
 
 def shift(
@@ -153,7 +153,6 @@ def test_a_logarithmic_range_is_drawn_as_often_below_its_geometric_mean_as_above
         ({"offset": [1]}, {"n": 5}, "goes with how='random'"),
         ({"offset": ep.Param(0)}, {"how": "random", "n": 3}, "range of 'offset' is open"),
         ({"offset": (4, 0)}, {"how": "random", "n": 3}, "Exchange them"),
-        ({"x": [1]}, {}, "'x' is a free source token"),
         ([{}], {}, "names a hyperparameter"),
     ],
 )
@@ -162,6 +161,12 @@ def test_a_grid_that_does_not_say_what_is_meant_is_refused(
 ) -> None:
     with pytest.raises(ScaleError, match=said):
         settings_of(runner, grid, **how)
+
+
+@pytest.mark.parametrize("grid", [{"x": [1]}, {"x": None}, [{"x": 1}]])
+def test_a_free_source_token_is_refused_as_the_runner_does(runner: ep.CompGraphRunner, grid: Any) -> None:
+    with pytest.raises(HyperparameterError, match="'x' is a free source token.*freeze"):
+        settings_of(runner, grid)
 
 
 @pytest.mark.parametrize("grid", [{"ofset": [1]}, [{"ofset": 1}], ["ofset"]])
