@@ -10,7 +10,6 @@ from __future__ import annotations
 import enum
 import math
 import numbers
-from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -482,14 +481,13 @@ def _slowest_first(cg: CompGraph, settings: Sequence[Setting]) -> list[str]:
     return sorted(settings[0], key=lambda name: -len(functions_after(cg, name)))
 
 
-def functions_after(cg: CompGraph, token: str) -> frozenset[str]:
-    """Return the functions that depend on a token, directly or by what others make of it."""
-    waiting, found = deque(cg.digraph.consumers.get(token, ())), set[str]()
-    while waiting:
-        function = waiting.popleft()
-        if function not in found:
+def functions_after(cg: CompGraph, *tokens: str) -> frozenset[str]:
+    """Return the functions that depend on one of these tokens, directly or by what others make of it."""
+    made, found = set(tokens), set[str]()
+    for function in cg.functions:  # in run order
+        if not made.isdisjoint(cg.func_inputs(function)):
             found.add(function)
-            waiting.extend(cg.digraph.successors(function))
+            made.update(cg.func_outputs(function))
     return frozenset(found)
 
 

@@ -292,7 +292,7 @@ def sweep(
 def _require_room_for_pictures(
     runner: CompGraphRunner, settings: Sequence[Setting], show: Sequence[str] | None, images: int
 ) -> None:
-    after = {function for name in settings[0] for function in functions_after(runner.cg, name)}
+    after = functions_after(runner.cg, *settings[0])
     varying = {token for function in after for token in runner.cg.func_outputs(function)}
     tokens = varying if show is None else varying.intersection(tokens_of(runner, show))
     pictures = len(settings) * images * len(tokens)

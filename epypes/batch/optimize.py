@@ -25,6 +25,7 @@ from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, axes_of, bounded
 from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
+from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
@@ -463,9 +464,8 @@ class _Objective:
         self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
         self._metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
-        self.keep = (metric,) if isinstance(metric, str) else tuple(runner.cg.sink_tokens if keep is None else keep)
-        for token in self.keep:
-            runner.cg.require_token(token)
+        kept = runner.cg.sink_tokens if keep is None else keep
+        self.keep = tokens_of(runner, metric if isinstance(metric, str) else kept)
 
     def score(self, outcomes: Mapping[int, Outcome]) -> tuple[float | None, str, int]:
         """Return the mean of the metric over the cases, or None and the first failure; and the time of the functions.
