@@ -306,7 +306,7 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
 
     Raises
     ------
-    UnknownName
+    UnknownName, HyperparameterError
         A range is for what is no hyperparameter of the runner.
     ScaleError
         A range can't be searched, or there is none.

@@ -265,7 +265,9 @@ def sweep(
     ScaleError
         The grid is empty, or too large to hold; there is no image; a package is missing.
     UnknownName
-        A name is none of a hyperparameter or token.
+        A name is none of a hyperparameter or token, or a value no branch of the switch that it selects.
+    HyperparameterError
+        A name is that of a token that is no hyperparameter.
     PayloadError
         ``images`` is None and nothing has been run yet.
 

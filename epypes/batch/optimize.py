@@ -302,7 +302,9 @@ def optimize(
         There are no cases, nothing that may vary, or no trial has completed; or in the first one an input can't be
         read, which ends the search.
     UnknownName
-        The graph has no such token, or the runner no such hyperparameter.
+        The graph has no such token.
+    HyperparameterError
+        A range is for a token that is no hyperparameter.
     StoreError
         The store can't be used.
 
