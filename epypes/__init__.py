@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from epypes.batch import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.batch.cases import Case
     from epypes.batch.check import check
+    from epypes.batch.mapping import SweepResult, sweep
     from epypes.batch.optimize import optimize
-    from epypes.batch.sweeping import SweepResult, sweep
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
@@ -122,8 +122,8 @@ _HOMES = {
     "MapResult": "epypes.batch",
     "map": "epypes.batch",
     "promote": "epypes.bundle",
-    "SweepResult": "epypes.batch.sweeping",
-    "sweep": "epypes.batch.sweeping",
+    "SweepResult": "epypes.batch.mapping",
+    "sweep": "epypes.batch.mapping",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
 }

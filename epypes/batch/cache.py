@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, Self
+from typing import Any, Final
 from warnings import warn
 
 from epypes.batch.items import Item
@@ -255,8 +255,17 @@ def outcome_cache(
         if doubt:
             warn(doubt, stacklevel=5)
         shown = "" if show == () else f"show={show and list(show)}"
-        with OutcomeCache(series, settings, f"{shown} state={found.state}", reads=not keep and not doubt) as cache:
+        cache = OutcomeCache(series, settings, f"{shown} state={found.state}", reads=not keep and not doubt)
+        try:
             yield cache
+        except BaseException as error:  # that is what is raised, whatever the store does
+            try:
+                cache.write()
+            except StoreError as failed:
+                if error is not failed:
+                    error.add_note(f"What waited to be stored could not be: {failed}")
+            raise
+        cache.write()
 
 
 def _doubt(found: Fingerprint, *, has_name: bool) -> str:
@@ -367,16 +376,3 @@ class OutcomeCache:
         self._series.append_all(self._waiting)
         self._waiting.clear()
         self._written_s = monotonic()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Write what waits; if something else has gone wrong before, that is what is raised."""
-        try:
-            self.write()
-        except StoreError as failed:
-            if error is None:
-                raise
-            if error is not failed:
-                error.add_note(f"What waited to be stored could not be: {failed}")

@@ -235,13 +235,6 @@ def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:
     return (*alone, *checks)
 
 
-def inputs_of(case: Case) -> Any:
-    """Return the inputs of a case as ``ep.map`` takes them: what names a file is its path."""
-    if isinstance(case.inputs, Mapping):
-        return {token: Path(value) if is_file(value) else value for token, value in case.inputs.items()}
-    return Path(case.inputs) if is_file(case.inputs) else case.inputs
-
-
 def with_labels_read(case: Case, cg: CompGraph) -> Case:
     """Return a case with the content of files in place of their paths in ``expected``.
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, inputs_of, with_labels_read
+from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, with_labels_read
 from epypes.batch.executors import run_jobs
 from epypes.batch.items import detached_runner, items_of, read_value
 from epypes.batch.job import Job
@@ -191,7 +191,7 @@ def run_checks(
     """
 
     def jobs() -> Iterator[Job]:
-        items = items_of([inputs_of(case) for case, _ in cases], runner)
+        items = items_of([case.inputs for case, _ in cases], runner)
         for item, (case, checks) in zip(items, cases, strict=True):
             show = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
             keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
@@ -93,7 +92,12 @@ class Sheet:
 
     def first(self, most: int) -> Sheet:
         """Return the sheet with its first tiles only; rows and blocks that have none are left out."""
-        return replace(self, blocks=tuple(_first_of(self.blocks, most)))
+        kept = {tile.place for tile in self.tiles[:most]}
+        blocks = []
+        for block in self.blocks:
+            rows = (tuple(tuple(tile for tile in cell if tile.place in kept) for cell in row) for row in block.rows)
+            blocks.append(Block(block.title, tuple(filter(any, rows))))
+        return replace(self, blocks=tuple(block for block in blocks if block.rows))
 
     def __repr__(self) -> str:
         tiles = self.tiles
@@ -105,18 +109,6 @@ class Sheet:
             return {"text/plain": repr(self), "text/html": sheet_page(self)}
         except Exception as error:  # a notebook shows the result whatever is wrong with its pictures
             return {"text/plain": f"{self!r}\n(no picture: {reason(error)})"}
-
-
-def _first_of(blocks: Iterable[Block], most: int) -> Iterator[Block]:
-    for block in blocks:
-        rows: list[tuple[Cell, ...]] = []
-        for row in block.rows:
-            counts = accumulate(map(len, row))
-            kept = tuple(cell if count <= most else () for count, cell in zip(counts, row, strict=True))
-            most -= sum(map(len, kept))
-            rows += [kept] * any(kept)
-        if rows:
-            yield Block(block.title, tuple(rows))
 
 
 # -- the layout -------------------------------------------------------------------------------------------------

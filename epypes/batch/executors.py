@@ -24,7 +24,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from epypes.batch.items import payload_of
-from epypes.batch.job import Job, run_job
+from epypes.batch.job import Job, failed_outcomes, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
     PackagedJob,
@@ -46,6 +46,7 @@ from epypes.wording import counted, ended
 # thread that waits on a lock.
 _LOOK_S: Final = 0.05
 _JOBS_PER_WORKER: Final = 2
+_KILLED: Final = ErrorInfo("", "KilledWorker", "every worker that ran it died")
 # How long a stop waits for the jobs that have begun.
 _GRACE_S: Final = 2.0
 
@@ -154,7 +155,7 @@ def _run_in_flight(
                     if job is not alone:
                         isolated.append(job)
                         continue
-                    outcomes = _killed(job)
+                    outcomes = failed_outcomes(job.item, job.settings, _KILLED)
                 done += len(outcomes)
                 yield outcomes
         over.set()
@@ -173,11 +174,6 @@ def _last_outcomes(backend: _Threads | _Processes, in_flight: dict[Future[Any], 
     for future in ready:
         with contextlib.suppress(_FilesMissing, _WorkersKilled):
             yield backend.outcomes_of(future, in_flight.pop(future))
-
-
-def _killed(job: Job) -> list[Outcome]:
-    info = ErrorInfo("", "KilledWorker", "every worker that ran it died")
-    return [Outcome(job.item.number, job.item.name, setting, error_info=info) for setting in job.settings]
 
 
 def _broken_text(done: int, error: BaseException) -> str:
@@ -296,8 +292,8 @@ class _Processes:
         # A worker process that has not unpacked the package yet asks for its files.
         package = package if with_files else replace(package, files=None)
         runner = self._runner
-        options = runner.workers, runner.guard, runner.check_mutation
-        packaged = PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed_job(job), *options)
+        options = tuple((name, getattr(runner, name)) for name in ("workers", "guard", "check_mutation"))
+        packaged = PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed_job(job), options)
         return _submitted(self._executor, run_packaged_job, packaged)
 
     def _proven(self, job: Job) -> PackagedGraph | None:

@@ -1,4 +1,4 @@
-"""Values of hyperparameters: the axes that a sweep or a search varies, and the grids of settings made of them.
+"""Values of hyperparameters: the axes that a sweep or a search varies, and the settings made of them.
 
 A sweep and a search read ranges by one rule. Steps are counted and added in decimals, as they are written: 0.1 and two
 steps of 0.1 are 0.3, for a reader and for Optuna, which reads ranges that way too; sums of floats are
@@ -10,7 +10,6 @@ from __future__ import annotations
 import enum
 import math
 import numbers
-from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -19,10 +18,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from epypes.catalog import parameter_names, plain, range_of
 from epypes.errors import ScaleError, UnknownName
-from epypes.graph import CompGraph, as_switch
+from epypes.graph import CompGraph
 from epypes.hints import Param, as_param, odd_step, param_from_value
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
+from epypes.run.branch import branched
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -220,16 +220,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _require_branches(runner: CompGraphRunner, token: str, values: Iterable[Any]) -> None:
-    """Raise UnknownName, with the nearest name, unless the switches that a token selects have these branches."""
-    cg = runner.cg
-    for function in cg.digraph.consumers.get(token, ()):
-        switch = as_switch(cg.functions[function])
-        if switch is not None and cg.func_inputs(function)[0] == token:
-            for value in values:
-                switch.branch_index(value)
-
-
 def _token_below(runner: CompGraphRunner, token: str, name: str) -> str:
     """Return the hyperparameter that a hint calls by its own name or by that of a function's parameter."""
     if not name or name in runner.hyperparameters:
@@ -268,18 +258,16 @@ def bounded(axes: Sequence[Axis], values: Setting, present: Setting) -> dict[str
 # -- ranges as the caller gives them ------------------------------------------------------------------------------
 
 
-def _require_hyperparameter(runner: CompGraphRunner, name: Any) -> None:
-    """Raise, with the nearest name, unless a runner has this hyperparameter."""
-    known = tuple(runner.hyperparameters)
-    if name in known:
-        return
-    if name in runner.free_source_tokens:
-        raise ScaleError(f"{name!r} is a free source token, which images are given to. Freeze it, or give images=...")
-    raise UnknownName("hyperparameter", name, known)
+def _require_settable(runner: CompGraphRunner, settings: Iterable[Setting]) -> None:
+    """Raise, as the runner does, unless all these values could be set: for a wrong name, or a branch that is none."""
+    trial = branched(runner)
+    for setting in settings:
+        trial.set(**setting)
 
 
 def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
     """Return the range or the choices that are given for a hyperparameter; None stands for its hint."""
+    _require_settable(runner, [{name: runner.hyperparameters.get(name)}])
     if given is None:
         found = range_of(runner.cg, name, runner.hyperparameters[name])
         if isinstance(found, Param):
@@ -300,7 +288,7 @@ def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
         raise ScaleError(
             f"{name}={given!r:.60} is neither a range, as (low, high), nor a list of values. Write {name}=[...]."
         )
-    _require_branches(runner, name, param.choices or ())
+    _require_settable(runner, ({name: choice} for choice in param.choices or ()))
     return param
 
 
@@ -318,7 +306,7 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
 
     Raises
     ------
-    UnknownName
+    UnknownName, HyperparameterError
         A range is for what is no hyperparameter of the runner.
     ScaleError
         A range can't be searched, or there is none.
@@ -336,14 +324,12 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
         raise ScaleError(f"{text} Give some: ranges={{'name': (low, high)}}, or annotate the functions.")
     if not ranges:
         raise ScaleError('ranges is empty, so nothing would vary. Name hyperparameters: ranges={"name": (low, high)}.')
-    for token in ranges:
-        _require_hyperparameter(runner, token)
-    params = {token: _param(runner, token, ranges[token]) for token in runner.cg.source_tokens if token in ranges}
+    params = {token: _param(runner, token, given) for token, given in ranges.items()}
     for token, param in params.items():
         if param.choices is None and not _is_number(plain(present[token])):
             text = f"{token!r} is {present[token]!r:.60}, so it has no range of numbers."
             raise ScaleError(f"{text} Give a list of choices: ranges={{{token!r}: [...]}}.")
-    return tuple(axis_of(runner, token, param) for token, param in params.items())
+    return tuple(axis_of(runner, token, params[token]) for token in runner.cg.source_tokens if token in params)
 
 
 def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
@@ -366,48 +352,27 @@ def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
 # -- grids --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Settings that are not written out yet.
-
-    Attributes
-    ----------
-    names
-        The hyperparameters that vary, in the order in which they were given.
-    size
-        How many settings there are.
-    settings
-        Returns them, each with a value for every name.
-    """
-
-    names: tuple[str, ...]
-    size: int
-    settings: Callable[[], tuple[Setting, ...]]
-
-    def require_room(self, images: int) -> None:
-        """Raise ScaleError if the settings, each on so many images, are too many to hold."""
-        if self.size * images > MOST_OUTCOMES:
-            raise too_many_outcomes(self.size, self.names, images)
+def require_room(size: int, names: Iterable[str], images: int) -> None:
+    """Raise ScaleError if the outcomes of so many settings, each on so many images, are too many to hold."""
+    if size * images > MOST_OUTCOMES:
+        each = f" on {images:,} images" if images != 1 else ""
+        raise ScaleError(
+            f"The grid has {size:,} settings of {', '.join(names)}{each}: {size * images:,} outcomes, "
+            f"and at most {MOST_OUTCOMES:,} can be held. Take fewer values, or how='random' with n=..."
+        )
 
 
-def too_many_outcomes(size: int, names: Iterable[str], images: int) -> ScaleError:
-    """Return the error of a grid whose settings, each on so many images, are too many to hold."""
-    each = f" on {images:,} images" if images != 1 else ""
-    return ScaleError(
-        f"The grid has {size:,} settings of {', '.join(names)}{each}: {size * images:,} outcomes, "
-        f"and at most {MOST_OUTCOMES:,} can be held. Take fewer values, or how='random' with n=..."
-    )
-
-
-def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0) -> Grid:
-    """Read a grid; see ``sweep``.
+def settings_of(
+    runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0, images: int = 1
+) -> tuple[Setting, ...]:
+    """Return the settings of a grid, each with a value for every hyperparameter that varies; see ``sweep``.
 
     Raises
     ------
     ScaleError
-        It does not tell which settings are meant, or is empty.
+        It does not tell which settings are meant, is empty, or has too many settings for so many images.
     UnknownName, HyperparameterError
-        A name is not a hyperparameter of the runner.
+        A name is not a hyperparameter of the runner, or a value none that the runner can have.
     """
     if how not in get_args(How):
         raise UnknownName("way to read a grid", how, get_args(How), "for how=")
@@ -419,35 +384,35 @@ def grid_of(runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int 
             f"n={n!r} goes with how='random' or how='latin'. A {how} has as many settings as its values make."
         )
     if _is_list_of(grid, Mapping):
-        return _listed(runner, grid)
+        return _listed(runner, grid, images)
     given = dict.fromkeys(grid) if _is_list_of(grid, str) else grid
     if not isinstance(given, Mapping) or not given:
         raise ScaleError(
             f"grid is a mapping of hyperparameters to values, as {{'threshold': [50, 70]}}, not {grid!r:.60}."
         )
-    for name in given:
-        _require_hyperparameter(runner, name)
-    return _drawn(runner, given, how, n or 0, seed) if is_drawn else _combined(runner, given, how)
+    if is_drawn:
+        require_room(n or 0, given, images)
+        return _drawn(runner, given, how, n or 0, seed)
+    return _combined(runner, given, how, images)
 
 
 def _is_list_of(grid: Any, kind: type) -> bool:
     return isinstance(grid, list | tuple) and bool(grid) and all(isinstance(one, kind) for one in grid)
 
 
-def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
-    """Return the grid of settings that are taken as they are; what one leaves out is the runner's."""
+def _listed(runner: CompGraphRunner, grid: Sequence[Setting], images: int) -> tuple[Setting, ...]:
+    """Return settings that are taken as they are; what one leaves out is the runner's."""
     names = tuple(dict.fromkeys(name for setting in grid for name in setting))
     if not names:
         raise ScaleError("No setting of the grid names a hyperparameter. Give some, as [{'threshold': 50}, ...].")
-    for name in names:
-        _require_hyperparameter(runner, name)
-        _require_branches(runner, name, [setting[name] for setting in grid if name in setting])
+    _require_settable(runner, grid)
+    require_room(len(grid), names, images)
     now = {name: runner.hyperparameters[name] for name in names}
-    return Grid(names, len(grid), lambda: tuple({**now, **setting} for setting in grid))
+    return tuple({**now, **setting} for setting in grid)
 
 
-def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Grid:
-    """Return the grid of each value with each other, or of the first values of all, the second ones, and so on."""
+def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str, images: int) -> tuple[Setting, ...]:
+    """Return the settings of each value with each other, or of the first values of all, the second ones, and so on."""
     values: dict[str, Sequence[Any]] = {}
     for name, of_name in given.items():
         if isinstance(of_name, tuple):
@@ -465,32 +430,25 @@ def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> Gr
             f"how='zip' takes the first values together, then the second, and so on, but {counts}. "
             "Give as many of each."
         )
-    size = max(lengths.values()) if how == "zip" else math.prod(lengths.values())
+    require_room(max(lengths.values()) if how == "zip" else math.prod(lengths.values()), values, images)
     combine: Callable[..., Iterable[tuple[Any, ...]]] = zip if how == "zip" else product
-    return Grid(
-        tuple(values), size, lambda: tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
-    )
+    return tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
 
 
-def _drawn(runner: CompGraphRunner, given: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
-    """Return the grid of settings that are drawn: at random, or by Latin hypercubes, with each n-th part once."""
+def _drawn(runner: CompGraphRunner, given: Mapping[str, Any], how: str, n: int, seed: int) -> tuple[Setting, ...]:
+    """Return settings that are drawn: at random, or by Latin hypercubes, with each n-th part once."""
+    import numpy as np
+
     axes = [axis_of(runner, name, _param(runner, name, of_name)) for name, of_name in given.items()]
-    present = runner.hyperparameters
-
-    def settings() -> tuple[Setting, ...]:
-        import numpy as np
-
-        generator = np.random.default_rng(seed)
-        if how == "random":
-            rows = generator.random((n, len(axes)))
-        else:
-            with optional_import():
-                from scipy.stats import qmc
-            rows = qmc.LatinHypercube(len(axes), seed=generator).random(n)
-        drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows.tolist())
-        return tuple(bounded(axes, setting, present) for setting in drawn)
-
-    return Grid(tuple(given), n, settings)
+    generator = np.random.default_rng(seed)
+    if how == "random":
+        rows = generator.random((n, len(axes)))
+    else:
+        with optional_import():
+            from scipy.stats import qmc
+        rows = qmc.LatinHypercube(len(axes), seed=generator).random(n)
+    drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows.tolist())
+    return tuple(bounded(axes, setting, runner.hyperparameters) for setting in drawn)
 
 
 # -- the order in which settings are run --------------------------------------------------------------------------
@@ -523,14 +481,13 @@ def _slowest_first(cg: CompGraph, settings: Sequence[Setting]) -> list[str]:
     return sorted(settings[0], key=lambda name: -len(functions_after(cg, name)))
 
 
-def functions_after(cg: CompGraph, token: str) -> frozenset[str]:
-    """Return the functions that depend on a token, directly or by what others make of it."""
-    waiting, found = deque(cg.digraph.consumers.get(token, ())), set[str]()
-    while waiting:
-        function = waiting.popleft()
-        if function not in found:
+def functions_after(cg: CompGraph, *tokens: str) -> frozenset[str]:
+    """Return the functions that depend on one of these tokens, directly or by what others make of it."""
+    made, found = set(tokens), set[str]()
+    for function in cg.functions:  # in run order
+        if not made.isdisjoint(cg.func_inputs(function)):
             found.add(function)
-            waiting.extend(cg.digraph.successors(function))
+            made.update(cg.func_outputs(function))
     return frozenset(found)
 
 

@@ -6,7 +6,7 @@ import glob
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
@@ -64,7 +64,7 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
         token = _only(free, f"{str(images)!r} gives one image")
         return iter([Item(number, _name(file, root), {token: file.absolute()}) for number, file in enumerate(files)])
     _check_set(images)
-    return _of_values(_each_copied(images), type(images).__name__, free)
+    return _of_values(images, free)
 
 
 def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
@@ -144,16 +144,18 @@ def _check_set(images: Any) -> None:
         raise ScaleError(f"images can't be {type(images).__name__!r}. Give {_KINDS}.")
 
 
-def _of_values(images: Iterable[Any], kind: str, free: tuple[str, ...]) -> Iterator[Item]:
-    number = -1
+def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
+    number, is_copied = -1, not holds_its_arrays(images)
     for number, value in enumerate(images):
         item = _item(number, value, free)
+        if is_copied:
+            item = replace(item, payload=defensive_copy(item.payload))
         # This generator waits for its caller, and must not keep the value alive meanwhile.
         del value
         yield item
         del item
     if number < 0:
-        raise ScaleError(f"The image set is empty: the {kind} gave nothing. Give {_KINDS}.")
+        raise ScaleError(f"The image set is empty: the {type(images).__name__} gave nothing. Give {_KINDS}.")
 
 
 def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
@@ -258,19 +260,6 @@ def defensive_copy(value: Any) -> Any:
 def holds_its_arrays(values: Any) -> bool:
     """Whether an iterable is a list, a tuple or an array; any other may give one array, filled again, each time."""
     return type(values) in (list, tuple) or is_array(values)
-
-
-def _each_copied(values: Iterable[Any]) -> Iterator[Any]:
-    """Yield the values of an iterable, copied unless it holds its arrays itself."""
-    if holds_its_arrays(values):
-        yield from values
-        return
-    for value in values:
-        copied = defensive_copy(dict(value) if isinstance(value, Mapping) else value)
-        # This generator waits for its caller, and must not keep the value alive meanwhile.
-        del value
-        yield copied
-        del copied
 
 
 def detached_runner(runner: CompGraphRunner) -> CompGraphRunner:

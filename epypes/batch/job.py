@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Final
@@ -69,8 +69,7 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
         try:
             payload = payload_of(item, runner.cg)
         except (EpypesError, OSError) as error:
-            info = ErrorInfo("", type(error).__name__, str(error))
-            begun.extend(Outcome(item.number, item.name, setting, error_info=info) for setting in waiting)
+            begun.extend(failed_outcomes(item, waiting, ErrorInfo("", type(error).__name__, str(error))))
             return None
         for setting in waiting:
             begun.append(_outcome(runner, job, setting, varied, payload, start.album))
@@ -89,6 +88,11 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     finally:
         if varied:
             runner.set(**varied)
+
+
+def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorInfo) -> list[Outcome]:
+    """Return the outcomes of an item that could not be run, for each of its settings."""
+    return [Outcome(item.number, item.name, setting, error_info=error_info) for setting in settings]
 
 
 def _outcome(

@@ -321,7 +321,7 @@ def _is_same(value: Any, expected: Any) -> bool:
     if type(value) is not type(expected) and isinstance(value, float | int) and isinstance(expected, float | int):
         return bool(value == expected)
     if _is_array(value) and isinstance(expected, list | tuple | float | int):
-        return equal(value, _array(expected)) == 1.0
+        return equal(value, np.asarray(expected)) == 1.0
     if isinstance(value, list | tuple) and isinstance(expected, list | tuple):
         return len(value) == len(expected) and all(map(_is_same, value, expected))
     return first_difference(expected, value) is None
@@ -336,26 +336,19 @@ def _pair(value: Any, expected: Any) -> tuple[Any, Any]:
 
 
 def _same_shape(value: Any, expected: Any) -> tuple[Any, Any]:
-    got, wanted = _array(value), _array(expected)
+    got, wanted = np.asarray(value), np.asarray(expected)
     if got.shape != wanted.shape:
         raise ValueError(f"The shapes differ: the value is {_kind(got)}, what was expected {_kind(wanted)}.")
     return got, wanted
 
 
 def _numbers(value: Any, expected: Any) -> tuple[Any, Any]:
-    for array in map(_array, (value, expected)):
+    for array in map(np.asarray, (value, expected)):
         if array.dtype.kind not in "biufc":
             raise ValueError(f"{_kind(array)} are no numbers.")
     got, wanted = _same_shape(value, expected)
     dtype = np.result_type(got.dtype, wanted.dtype, np.float64)
     return got.astype(dtype), wanted.astype(dtype)
-
-
-def _array(value: Any) -> Any:
-    try:
-        return np.asarray(value)
-    except ValueError as error:
-        raise ValueError(f"{_kind(value)} is no array: its parts differ in length.") from error
 
 
 def _kind(value: Any) -> str:

@@ -11,44 +11,224 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from epypes.batch.cache import payload_digest, search_digests
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, axes_of, bounded
-from epypes.batch.items import Item, detached_runner, items_of
+from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
+from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome
-from epypes.batch.search_result import Direction, OptimizeResult, Trial, quiet_optuna
+from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
+from epypes.batch.thumbnails import data_uri, thumbnail_of_value
 from epypes.bundle.fingerprint import combined_digest
+from epypes.display.durations import duration_text
+from epypes.display.markup import content, cut, cut_name, escape
 from epypes.errors import ScaleError
-from epypes.graph import CompGraph
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
-from epypes.wording import ended
+from epypes.wording import counted, ended
 
 if TYPE_CHECKING:
     import optuna
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from epypes.store import Store
 
 # Of the values that are held between settings; further cases run from their files or arrays each time.
 MOST_BYTES: Final = 2**30
 _CASE_FILE: Final = ".toml"
+Direction = Literal["maximize", "minimize"]
 ObjectiveMetric = Callable[[Mapping[str, Any], Case], Any] | str
 _REASON_CHARACTERS: Final = 300
 # The attributes of trials and studies in Optuna's tables.
 _FAILURE: Final = "failure"
 _NANOSECONDS: Final = "total_ns"
 _DIGESTS: Final = "about"
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One setting that was tried.
+
+    Attributes
+    ----------
+    number
+        Of the trial in its study, from 0.
+    setting
+        The hyperparameters that vary, by token.
+    value
+        The metric, averaged over the cases; None if the trial failed.
+    failure
+        Why it failed; empty if it did not.
+    total_ns
+        Nanoseconds of the functions that ran, over all cases.
+    """
+
+    number: int
+    setting: Mapping[str, Any]
+    value: float | None
+    failure: str = ""
+    total_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OptimizeResult:
+    """The trials of a search; made by ``ep.optimize``.
+
+    Attributes
+    ----------
+    trials
+        That have ended, by number; the first has the values that the runner had.
+    direction
+        ``"maximize"`` or ``"minimize"``.
+    metric
+        The name of the metric.
+    axes
+        What was searched.
+    study
+        Of Optuna, in memory.
+    was_stopped
+        Whether the search was stopped before all trials were run.
+    """
+
+    trials: tuple[Trial, ...] = field(repr=False)
+    direction: Direction
+    metric: str
+    axes: tuple[Axis, ...] = field(repr=False)
+    study: optuna.Study = field(repr=False)
+    was_stopped: bool = False
+
+    def __len__(self) -> int:
+        return len(self.trials)
+
+    def __iter__(self) -> Iterator[Trial]:
+        return iter(self.trials)
+
+    def __getitem__(self, index: int) -> Trial:
+        return self.trials[index]
+
+    @property
+    def best_trial(self) -> Trial:
+        """The trial with the best value, the first of several.
+
+        Raises
+        ------
+        ScaleError
+            None has completed.
+        """
+        best = best_of(self.trials, self.direction)
+        if best is None:
+            raise ScaleError(f"None of {len(self.trials)} trials has completed, so there is no best one.")
+        return best
+
+    @property
+    def best(self) -> dict[str, Any]:
+        """The hyperparameters that vary, as the best trial had them."""
+        return dict(self.best_trial.setting)
+
+    @property
+    def best_value(self) -> float:
+        """The metric of the best trial, averaged over the cases."""
+        return _value(self.best_trial)
+
+    @property
+    def failures(self) -> tuple[Trial, ...]:
+        """The trials that failed."""
+        return tuple(trial for trial in self.trials if trial.value is None)
+
+    @property
+    def importances(self) -> dict[str, float]:
+        """How much each hyperparameter matters for good values, as parts of 1, the most important first.
+
+        By PED-ANOVA (Watanabe, Bansal and Hutter 2023, IJCAI), as Optuna has it; empty if fewer than two different
+        values were found.
+        """
+        import optuna
+
+        completed = self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+        if len({trial.value for trial in completed}) < 2:
+            return {}
+        with quiet_optuna():
+            evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+            return dict(optuna.importance.get_param_importances(self.study, evaluator=evaluator))
+
+    def apply(self, runner: CompGraphRunner) -> None:
+        """Set the best values on a runner."""
+        runner.set(**self.best)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table with a row per trial.
+
+        Returns
+        -------
+        pandas.DataFrame
+            ``trial``, the hyperparameters, the metric by its name, ``state`` (``"complete"`` or ``"failed"``),
+            ``failure`` (None, or the reason), and ``ms``: of the functions, over all cases. A hyperparameter that is
+            called like one of these has `` (hyperparameter)`` after its name.
+        """
+        taken = {"trial", self.metric, "state", "failure", "ms"}
+        columns: dict[str, Any] = {"trial": [trial.number for trial in self.trials]}
+        for axis in self.axes:
+            title = f"{axis.token} (hyperparameter)" if axis.token in taken else axis.token
+            columns[title] = [trial.setting[axis.token] for trial in self.trials]
+        columns[self.metric] = [float("nan") if trial.value is None else trial.value for trial in self.trials]
+        columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
+        columns["failure"] = object_column([trial.failure or None for trial in self.trials])
+        columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
+        return frame_of(columns)
+
+    def history_plot(self) -> Figure:
+        """Draw the value of each trial that completed, and the best one so far, as Optuna does with Matplotlib."""
+        from optuna.visualization.matplotlib import plot_optimization_history
+
+        _ = self.best_trial  # without one there is nothing to draw
+        return _figure(lambda: plot_optimization_history(self.study, target_name=self.metric))
+
+    def importance_plot(self) -> Figure:
+        """Draw how much each hyperparameter matters, as Optuna does with Matplotlib."""
+        from optuna.importance import PedAnovaImportanceEvaluator
+        from optuna.visualization.matplotlib import plot_param_importances
+
+        _ = self.best_trial
+        with quiet_optuna():
+            # The default one of older versions needs scikit-learn.
+            evaluator = PedAnovaImportanceEvaluator()
+            return _figure(lambda: plot_param_importances(self.study, evaluator, target_name=self.metric))
+
+    def __repr__(self) -> str:
+        best = best_of(self.trials, self.direction)
+        found = "none completed" if best is None else f"best {self.metric:.30} {best.value:.6g}"
+        stopped = ", stopped" * self.was_stopped
+        return f"<OptimizeResult: {counted(len(self.trials), 'trial')}{stopped}; {found}>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        return {"text/plain": repr(self), "text/html": _page(self)}
+
+
+def best_of(trials: Sequence[Trial], direction: Direction) -> Trial | None:
+    """Return the trial with the best value, the first of several; None if none has completed."""
+    completed = [trial for trial in trials if trial.value is not None]
+    choose = max if direction == "maximize" else min
+    return choose(completed, key=_value) if completed else None
+
+
+def _value(trial: Trial) -> float:
+    return float(trial.value or 0.0)
+
+
+# -- the search -----------------------------------------------------------------------------------------------------
 
 
 def optimize(
@@ -122,7 +302,9 @@ def optimize(
         There are no cases, nothing that may vary, or no trial has completed; or in the first one an input can't be
         read, which ends the search.
     UnknownName
-        The graph has no such token, or the runner no such hyperparameter.
+        The graph has no such token.
+    HyperparameterError
+        A range is for a token that is no hyperparameter.
     StoreError
         The store can't be used.
 
@@ -141,20 +323,18 @@ def optimize(
     # A caller that sets hyperparameters meanwhile, or writes into them, does not change what is searched.
     runner = detached_runner(runner)
     axes = axes_of(runner, ranges)
-    objective = _Objective(runner.cg, metric, _cases(cases, runner), keep)
-    inputs = items_of([case.inputs for case in objective.cases], runner)
-    items = [replace(item, name=case.name or item.name) for case, item in zip(objective.cases, inputs, strict=True)]
+    objective = _Objective(runner, metric, _cases(cases, runner), keep)
     at_once = 1 if executor is None else worker_count(executor)
     with opened_store(store) as opened:
         digests, study = dict[str, str](), name or ""
         if opened is not None:
-            data = _searched_data(axes, runner.hyperparameters, objective, items)
+            data = _searched_data(axes, objective)
             digests = search_digests(runner.cg, metric, data, is_named=bool(name))
             text = repr((direction, axes, sorted(digests.items())))
             study = name or f"optimize {objective.name} {combined_digest('search', text).hex()[:12]}"
         search = _Search(axes, runner.hyperparameters, direction, seed, at_once, opened, study, digests)
         with contextlib.closing(search):
-            was_stopped = _searched(search, _Work(runner, objective, items, executor, stop), n, on_trial, progress)
+            was_stopped = _searched(search, objective, executor, stop or threading.Event(), n, on_trial, progress)
             if opened is not None:
                 search.forget_changed(search_digests(runner.cg, metric, {}, is_named=True))
     result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
@@ -165,15 +345,13 @@ def optimize(
     return result
 
 
-def _searched_data(
-    axes: Sequence[Axis], hyperparameters: Mapping[str, Any], objective: _Objective, items: Sequence[Item]
-) -> dict[str, Callable[[], Any]]:
+def _searched_data(axes: Sequence[Axis], objective: _Objective) -> dict[str, Callable[[], Any]]:
     """Return the data that decide about a trial, by what they are, for their digests."""
     choices = {axis.token: getattr(axis, "choices", None) for axis in axes}
-    fixed = {token: value for token, value in hyperparameters.items() if token not in choices}
+    fixed = {token: value for token, value in objective.runner.hyperparameters.items() if token not in choices}
     return {
         "hyperparameters": lambda: (fixed, choices),
-        "inputs of the cases": lambda: [(item.name, payload_digest(item.payload)) for item in items],
+        "inputs of the cases": lambda: [(item.name, payload_digest(item.payload)) for item in objective.items],
         "labels of the cases": lambda: [
             (case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases
         ],
@@ -189,39 +367,37 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
 
 
 def _searched(
-    search: _Search, work: _Work, n: int, on_trial: Callable[[Trial], object] | None, progress: bool | None
+    search: _Search,
+    objective: _Objective,
+    executor: Executor | None,
+    stop: threading.Event,
+    n: int,
+    on_trial: Callable[[Trial], object] | None,
+    progress: bool | None,
 ) -> bool:
     """Run the trials that are still to be run; return whether the search was stopped before its end."""
     done = search.trials
-    with progress_bar(progress, n, f"optimize {work.objective.name}", unit="trial") as advance:
+    with progress_bar(progress, n, f"optimize {objective.name}", unit="trial") as advance:
         advance(len(done), sum(trial.value is None for trial in done))
         try:
-            with contextlib.closing(_trials(search, work, n - len(done))) as coming:
+            with contextlib.closing(_trials(search, objective, executor, stop, n - len(done))) as coming:
                 for trial in coming:
                     advance(1, trial.value is None)
                     if on_trial is not None:
                         on_trial(trial)
         except KeyboardInterrupt:
             return True
-    return work.stop is not None and work.stop.is_set()
+    return stop.is_set()
 
 
-class _Work(NamedTuple):
-    """What the trials of a search run, and where."""
-
-    runner: CompGraphRunner
-    objective: _Objective
-    items: Sequence[Item]
-    executor: Executor | None
-    stop: threading.Event | None
-
-
-def _trials(search: _Search, work: _Work, count: int) -> Generator[Trial]:
+def _trials(
+    search: _Search, objective: _Objective, executor: Executor | None, stop: threading.Event, count: int
+) -> Generator[Trial]:
     """Run the next trials and yield them as they end; fewer if the search is stopped."""
     asked: dict[int, optuna.trial.Trial] = {}
     found: dict[int, dict[int, Outcome]] = {}
     # In this process each case goes on from its last run, as far as memory is for that.
-    starts = [SharedStart() if runs_here(work.executor) else None for _ in work.items]
+    starts = [SharedStart() if runs_here(executor) else None for _ in objective.items]
     held_bytes: dict[int, int] = {}
 
     def jobs() -> Iterator[Job]:
@@ -229,18 +405,18 @@ def _trials(search: _Search, work: _Work, count: int) -> Generator[Trial]:
         for number in range(count):
             asked[number], found[number] = search.ask(), {}
             setting = search.setting(asked[number].params)
-            for index, (item, case) in enumerate(zip(work.items, work.objective.cases, strict=True)):
+            for index, (item, case) in enumerate(zip(objective.items, objective.cases, strict=True)):
                 if number not in asked:  # a case before has failed
                     break
-                marked = replace(item, number=number * len(work.items) + index)
+                marked = replace(item, number=number * len(objective.items) + index)
                 own = {**setting, **(case.hyperparameters or {})}
-                yield Job(marked, (own,), keep=work.objective.keep, start=starts[index], targets=work.objective.keep)
+                yield Job(marked, (own,), keep=objective.keep, start=starts[index], targets=objective.keep)
 
-    ahead = None if work.executor is None else worker_count(work.executor)
+    ahead = None if executor is None else worker_count(executor)
     has_ended = False
-    for outcomes in run_jobs(work.runner, jobs(), work.executor, ahead=ahead, stop=work.stop):
+    for outcomes in run_jobs(objective.runner, jobs(), executor, ahead=ahead, stop=stop):
         for outcome in outcomes:
-            number, index = divmod(outcome.number, len(work.items))
+            number, index = divmod(outcome.number, len(objective.items))
             start, error = starts[index], outcome.error_info
             if start is not None and index not in held_bytes:
                 held_bytes[index] = start.nbytes
@@ -251,18 +427,18 @@ def _trials(search: _Search, work: _Work, count: int) -> Generator[Trial]:
             if error is not None and error.is_unreadable and not has_ended:
                 raise ScaleError(f"No trial can complete: {ended(error.message)} Mend the file, or leave it out.")
             found[number][index] = outcome
-            if len(found[number]) == len(work.items) or error is not None:
+            if len(found[number]) == len(objective.items) or error is not None:
                 has_ended = True
-                yield search.tell(asked.pop(number), *work.objective.score(found.pop(number)))
+                yield search.tell(asked.pop(number), *objective.score(found.pop(number)))
 
 
 class _Objective:
-    """Measures outcomes.
+    """Runs cases and measures their outcomes.
 
     Parameters
     ----------
-    cg
-        The graph.
+    runner
+        Its graph is run, with its hyperparameters where nothing varies.
     metric
         ``metric(tokens, case)`` is called with the kept tokens of a run and its case, on the thread of the caller; or
         the name of a token that is a number.
@@ -280,17 +456,18 @@ class _Objective:
     """
 
     def __init__(
-        self, cg: CompGraph, metric: ObjectiveMetric, cases: Sequence[Case], keep: Sequence[str] | None
+        self, runner: CompGraphRunner, metric: ObjectiveMetric, cases: Sequence[Case], keep: Sequence[str] | None
     ) -> None:
         if not isinstance(metric, str) and not callable(metric):
             kind = type(metric).__name__
             raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
-        self.cases = tuple(cases)
+        self.runner, self.cases = runner, tuple(cases)
+        items = items_of([case.inputs for case in cases], runner)
+        self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
         self._metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
-        self.keep = (metric,) if isinstance(metric, str) else tuple(cg.sink_tokens if keep is None else keep)
-        for token in self.keep:
-            cg.require_token(token)
+        kept = runner.cg.sink_tokens if keep is None else keep
+        self.keep = tokens_of(runner, metric if isinstance(metric, str) else kept)
 
     def score(self, outcomes: Mapping[int, Outcome]) -> tuple[float | None, str, int]:
         """Return the mean of the metric over the cases, or None and the first failure; and the time of the functions.
@@ -482,3 +659,89 @@ def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
 def _range_text(distribution: Any) -> str:
     choices = getattr(distribution, "choices", None)
     return ", ".join(map(str, choices)) if choices else f"{distribution.low:g} to {distribution.high:g}"
+
+
+# -- figures and page -------------------------------------------------------------------------------------------
+
+
+def _figure(draw: Callable[[], Axes]) -> Figure:
+    """Return a figure that Optuna draws; it leaves no style set, and no figure open in pyplot."""
+    from matplotlib import pyplot
+
+    with pyplot.rc_context(), quiet_optuna():
+        draw()
+        figure = pyplot.gcf()
+    pyplot.close(figure)
+    return figure
+
+
+_MOST_REASONS: Final = 3
+
+
+def _page(result: OptimizeResult) -> str:
+    best = best_of(result.trials, result.direction)
+    parts = [f"<p>{content(_sentence(result))}</p>"]
+    if best is not None:
+        parts += [_curve(result), _table(result, best)]
+    reasons = list(dict.fromkeys(trial.failure for trial in result.failures))
+    if reasons:
+        items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
+        more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
+        parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
+    return f"<div>{''.join(parts)}</div>"
+
+
+def _curve(result: OptimizeResult) -> str:
+    """Return a picture of the best value so far, by trial that completed."""
+    import numpy as np
+
+    values = [trial.value for trial in result.trials if trial.value is not None]
+    so_far = np.maximum.accumulate(values) if result.direction == "maximize" else np.minimum.accumulate(values)
+    picture = thumbnail_of_value(so_far)
+    if picture is None:
+        return ""
+    alt = escape(f"The best {cut_name(result.metric, 30)} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}.")
+    return f'<img src="{data_uri(picture)}" width="256" alt="{alt}" title="{alt}">'
+
+
+def _table(result: OptimizeResult, best: Trial) -> str:
+    first, parts = result.trials[0], result.importances
+    rows = [
+        (
+            axis.token,
+            value_text(best.setting[axis.token]),
+            value_text(first.setting[axis.token]),
+            f"{parts[axis.token]:.0%}" if axis.token in parts else "",
+        )
+        for axis in sorted(result.axes, key=lambda axis: -parts.get(axis.token, 0.0))
+    ]
+    values = (result.metric, f"{best.value:.6g}", "failed" if first.value is None else f"{first.value:.6g}", "")
+    head = ("hyperparameter", f"best (trial {best.number})", "first trial", "importance")
+    return html_table("", head, [values, *rows])
+
+
+def _sentence(result: OptimizeResult) -> str:
+    best = best_of(result.trials, result.direction)
+    spent_ns = sum(trial.total_ns for trial in result.trials)
+    failed = f", {len(result.failures)} failed" if result.failures else ""
+    stopped = ", stopped before its end" * result.was_stopped
+    trials = f"{counted(len(result.trials), 'trial')}{failed}{stopped}, {duration_text(spent_ns)} of functions."
+    if best is None:
+        return f"{trials} None has completed."
+    what = f"To {result.direction} {cut_name(result.metric, 40)}"
+    return f"{trials} {what}: {best.value:.6g} is the best, of trial {best.number}."
+
+
+@contextlib.contextmanager
+def quiet_optuna() -> Iterator[None]:
+    """Keep Optuna from printing, and from warning that a feature used here was once experimental."""
+    import optuna
+
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            yield
+    finally:
+        optuna.logging.set_verbosity(before)

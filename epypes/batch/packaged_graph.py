@@ -54,13 +54,10 @@ class PackagedGraph:
         Of its files; a worker process knows by it what it has unpacked.
     files
         Their contents by path, without samples; None where they are left out.
-    requirements
-        The packages that a worker process needs.
     """
 
     digest: str
     files: Mapping[str, bytes] | None
-    requirements: str = ""
 
 
 # The packages that this process has made, by what they compute; the oldest ones go.
@@ -94,7 +91,7 @@ def package_of(runner: CompGraphRunner) -> PackagedGraph:
         paths = sorted(file for file in bundle.path.rglob("*") if file.is_file() and SAMPLES not in file.parts)
         files = {str(file.relative_to(bundle.path)): file.read_bytes() for file in paths}
     digest = combined_digest(*(part for file in files.items() for part in file)).hex()
-    package = PackagedGraph(digest, files, files.get("requirements.txt", b"").decode())
+    package = PackagedGraph(digest, files)
     if (key := _key_of(runner)) is not None:
         _PACKAGES[key] = package
         _drop_oldest(_PACKAGES, _MOST_PACKAGES)
@@ -234,24 +231,22 @@ class PackagedJob:
         The runner's, packed.
     job
         The job, packed.
-    workers, guard, check_mutation
-        Options of the runner.
+    options
+        Of the runner, by name.
     """
 
     id: str
     package: PackagedGraph
     hyperparameters: Mapping[str, Any]
     job: Job
-    workers: int = 1
-    guard: bool = True
-    check_mutation: bool = False
+    options: tuple[tuple[str, Any], ...] = ()
 
     def __dask_tokenize__(self) -> str:
         return self.id
 
 
 # By package and options: the members of the bundle's enumerations, and a runner that each job branches from.
-_LOADED: Final[dict[tuple[str, int, bool, bool], tuple[Mapping[str, Any], CompGraphRunner]]] = {}
+_LOADED: Final[dict[tuple[str, tuple[tuple[str, Any], ...]], tuple[Mapping[str, Any], CompGraphRunner]]] = {}
 _LOAD_LOCK: Final = threading.Lock()
 
 
@@ -264,7 +259,7 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
         The outcomes, packed; or why this process can't run the job; None if it has not unpacked the package yet, and
         the files have not come with the job.
     """
-    key = packaged.package.digest, packaged.workers, packaged.guard, packaged.check_mutation
+    key = packaged.package.digest, packaged.options
     with _LOAD_LOCK:
         if key not in _LOADED:
             if packaged.package.files is None:
@@ -272,10 +267,9 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
             try:
                 bundle = _unpacked(packaged.package.files)
                 values = unpacked_values(packaged.hyperparameters, bundle.enums)
-                options = {name: getattr(packaged, name) for name in ("workers", "guard", "check_mutation")}
-                _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **options)
+                _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options))
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
-                return _load_error(packaged.package, error)
+                return _load_error(packaged.package.files, error)
             _drop_oldest(_LOADED, _MOST_LOADED)
         enums, runner = _LOADED[key]
     own = branched(runner)
@@ -296,9 +290,10 @@ def _unpacked(files: Mapping[str, bytes]) -> Bundle:
         return read_bundle(Path(folder) / "graph", compare=False)
 
 
-def _load_error(package: PackagedGraph, error: BaseException) -> str:
+def _load_error(files: Mapping[str, bytes], error: BaseException) -> str:
     where = f"Worker process {os.getpid()} on {socket.gethostname()}"
-    needs = ", ".join(line for line in package.requirements.splitlines() if line and not line.startswith("#"))
+    requirements = files.get("requirements.txt", b"").decode()
+    needs = ", ".join(line for line in requirements.splitlines() if line and not line.startswith("#"))
     way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
     reason = ended(f"{type(error).__name__}: {error}")
     return f"{where} can't load the graph: {reason} {way_out}; or use an executor of this machine."

@@ -6,7 +6,7 @@ import base64
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, overload
 
@@ -103,17 +103,11 @@ class Outcome:
 
     def to_json(self) -> dict[str, Any]:
         """Return all but ``kept`` as JSON can hold it."""
-        thumbnails = {
-            token: {**asdict(shown), "data": base64.b64encode(shown.data).decode()}
-            for token, shown in self.thumbnails.items()
-        }
-        return {
-            **{part.name: getattr(self, part.name) for part in fields(self) if part.name != "kept"},
-            "setting": {token: short_value(value) for token, value in self.setting.items()},
-            "times_ns": dict(self.times_ns),
-            "error_info": None if self.error_info is None else asdict(self.error_info),
-            "thumbnails": thumbnails,
-        }
+        setting = {token: short_value(value) for token, value in self.setting.items()}
+        data = asdict(replace(self, setting=setting, times_ns=dict(self.times_ns), kept={}))
+        for shown in data["thumbnails"].values():
+            shown["data"] = base64.b64encode(shown["data"]).decode()
+        return {name: part for name, part in data.items() if name != "kept"}
 
     @staticmethod
     def from_json(data: Mapping[str, Any], item: Item, setting: Mapping[str, Any]) -> Outcome:
@@ -123,14 +117,9 @@ class Outcome:
             token: Thumbnail(**{**shown, "data": base64.b64decode(shown["data"])})
             for token, shown in data["thumbnails"].items()
         }
-        found = {
-            "number": item.number,
-            "name": item.name,
-            "setting": setting,
-            "error_info": None if info is None else ErrorInfo(**info),
-            "thumbnails": thumbnails,
-        }
-        return Outcome(**{**data, **found})
+        error_info = None if info is None else ErrorInfo(**info)
+        found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting)
+        return replace(found, error_info=error_info, thumbnails=thumbnails)
 
 
 class OutcomeSequence(Sequence[Outcome]):

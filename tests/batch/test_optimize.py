@@ -24,7 +24,7 @@ from matplotlib import pyplot
 
 import epypes as ep
 from epypes.batch.grid import ChoiceAxis
-from epypes.batch.search_result import OptimizeResult, Trial
+from epypes.batch.optimize import OptimizeResult, Trial
 from epypes.errors import ScaleError, UnknownName
 from tests.store.postgres import PASSWORD, server
 

@@ -20,7 +20,7 @@ from epypes_widgets.stored import StoredHistory
 from epypes_widgets.verdicts import case_payloads, cases_to_show
 
 if TYPE_CHECKING:
-    from epypes.batch.search_result import Direction
+    from epypes.batch.optimize import Direction
     from epypes.service.remote.connection import Connection
 
 

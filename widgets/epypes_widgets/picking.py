@@ -13,7 +13,7 @@ import anywidget
 
 from epypes.batch.contact_sheet import Block, Sheet, Tile, sheet_page, shown_tokens
 from epypes.batch.grid import identity
-from epypes.batch.sweeping import SweepResult
+from epypes.batch.mapping import SweepResult
 from epypes.display.markup import cut
 from epypes.errors import EpypesError
 from epypes_widgets.route import listen_beside_cells

@@ -17,7 +17,7 @@ from epypes_widgets.places import Tunable
 from epypes_widgets.values import said
 
 if TYPE_CHECKING:
-    from epypes.batch.search_result import Direction, OptimizeResult, Trial
+    from epypes.batch.optimize import Direction, OptimizeResult, Trial
 
 _LOG: Final = logging.getLogger(__name__)
 # The eye follows no more, and each time the whole curve goes to the page.
@@ -236,7 +236,7 @@ def search_of(
 
 
 def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: State) -> Found:
-    from epypes.batch.search_result import best_of
+    from epypes.batch.optimize import best_of
 
     best = best_of(trials, direction)
     text = (
@@ -250,7 +250,7 @@ def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: State)
 
 
 def _at_end(result: OptimizeResult, n: int) -> Found:
-    from epypes.batch.search_result import best_of
+    from epypes.batch.optimize import best_of
 
     best = best_of(result.trials, result.direction)
     failed = f", {len(result.failures)} failed" if result.failures else ""

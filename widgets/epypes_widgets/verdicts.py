@@ -12,7 +12,7 @@ from dataclasses import replace
 from time import monotonic
 from typing import Any, Final
 
-from epypes.batch.cases import Case, Check, inputs_of
+from epypes.batch.cases import Case, Check
 from epypes.batch.check import CheckOutcome, CheckResult, Checks, prepare_cases, run_checks
 from epypes.batch.items import items_of, payload_of, read_value
 from epypes.errors import EpypesError, PayloadError
@@ -167,7 +167,7 @@ class Verdicts:
 
 def case_payloads(runner: Tunable, cases: Checks) -> tuple[Payload, ...]:
     """Return the inputs of cases as what a panel can be switched to."""
-    return payloads(runner, [inputs_of(case) for case, _ in cases], [case.name or "" for case, _ in cases])
+    return payloads(runner, [case.inputs for case, _ in cases], [case.name or "" for case, _ in cases])
 
 
 def cases_to_show(runner: Tunable, images: object, cases: Any) -> Checks:
@@ -196,7 +196,7 @@ def cases_to_show(runner: Tunable, images: object, cases: Any) -> Checks:
 
 def _held(runner: CompGraphRunner, cases: Checks) -> Checks:
     """Return cases whose files have been read; what was expected and can't be read is left to fail each time."""
-    items = items_of((inputs_of(case) for case, _ in cases), runner)
+    items = items_of((case.inputs for case, _ in cases), runner)
     return [
         (replace(case, inputs=payload_of(item, runner.cg), expected=_labels(case, runner)), _with_label(checks, runner))
         for item, (case, checks) in zip(items, cases, strict=True)
