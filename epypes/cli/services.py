@@ -195,7 +195,7 @@ def stop(source: str, timeout_s: float, replica: str) -> None:
     late = []
     with ExitStack() as opened:
         # All are ended before the first is waited for.
-        for state, process in [(state, _terminate(source, state, opened)) for state in states]:
+        for state, process in [(state, _terminate(state, opened)) for state in states]:
             if process is None or select.select([process], [], [], max(end_s - monotonic(), 0.0))[0]:
                 named = f", replica {state.replica}" if state.replica else ""
                 click.echo(f"STOPPED {source}{named}, process {state.pid}.")
@@ -205,7 +205,7 @@ def stop(source: str, timeout_s: float, replica: str) -> None:
         raise ServiceError(source, f"{' '.join(late)} has not ended within {timeout_s:g} s. Wait longer: --timeout.")
 
 
-def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | None:
+def _terminate(state: ServiceState, opened: ExitStack) -> int | None:
     """Send SIGTERM to a process; return its file descriptor, or None if it has ended already.
 
     Unlike a process number, the descriptor never means a later process.
@@ -216,9 +216,6 @@ def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | Non
         signal.pidfd_send_signal(process, signal.SIGTERM)
     except ProcessLookupError:
         return None
-    except OSError as error:
-        text = f"Process {state.pid}, which serves {source}, can't be ended: {error.strerror}."
-        raise ServiceError(source, text) from error
     return process
 
 
