@@ -1,7 +1,7 @@
 """Images from files, videos and cameras, and image files that are written.
 
 - ``acquisition``: several cameras at once, each with a thread that keeps its recent frames (``frames``)
-- ``cameras``: a camera of any source, and its frames per second; ``captures`` those of OpenCV's VideoCapture
+- ``cameras``: a camera of any source, and its frames per second
 - ``files``: image files and folders
 """
 

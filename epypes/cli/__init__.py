@@ -24,6 +24,9 @@ def main(arguments: list[str] | None = None) -> None:
         status = _INTERRUPTED
     except EpypesError as error:
         status = f"epypes: {error}"
+    except OSError as error:  # of a file that the user named: no permission, no room, no such folder
+        where = f"{error.filename} can't be used: " if error.filename else ""
+        status = f"epypes: {where}{error.strerror or error}."
     except ModuleNotFoundError as error:
         from epypes.optional import missing_package
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,8 +17,6 @@ from epypes.wording import counted, ended
 if TYPE_CHECKING:
     from epypes.batch.check import CheckOutcome
     from epypes.bundle.replay import ReplayReport
-
-_MAX_ROWS: Final = 100
 
 
 @click.command()
@@ -172,6 +170,4 @@ def _to_json(outcome: CheckOutcome) -> dict[str, Any]:
 def _print_failures(failures: Sequence[CheckOutcome]) -> None:
     short: dict[str, Any] = {"no_wrap": True, "min_width": 8, "max_width": 24}
     columns = {"case": short, "check": short, "must be": short, "reason": {"overflow": "fold", "ratio": 1}}
-    print_table(columns, ((each.case, each.check, each.threshold, each.reason) for each in failures[:_MAX_ROWS]))
-    if len(failures) > _MAX_ROWS:
-        click.echo(f"and {counted(len(failures) - _MAX_ROWS, 'check')} more")
+    print_table(columns, ((each.case, each.check, each.threshold, each.reason) for each in failures))

@@ -11,7 +11,6 @@ import click
 
 from epypes.cli.options import PATH, seconds_option
 from epypes.cli.terminal import print_table
-from epypes.errors import ExperimentError
 
 if TYPE_CHECKING:
     from epypes.experiment import Results
@@ -48,10 +47,7 @@ def experiment(layout: str, workers: int, camera: Sequence[str], to: Path | None
     from epypes.experiment import run_experiment
 
     if to is not None:
-        try:
-            to.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ExperimentError("out", f"{to} can't be made: {error.strerror}.") from error
+        to.mkdir(parents=True, exist_ok=True)
     total = options["requests"] * options["experiments"]
     # Drawing takes the processor from what is measured: it is done between requests, and not often.
     often = {"update_min_steps": max(1, total // _MAX_DRAWINGS), "hidden": not sys.stderr.isatty()}
@@ -85,10 +81,7 @@ def _write(results: Results, folder: Path, *, side_by_side: bool) -> list[Path]:
     table, csv = results.table, folder / "requests.csv"
     drawn = {14: figure_14(table), 15: figure_15(table, side_by_side=side_by_side), 16: figure_16(table)}
     figures = {folder / f"figure_{number}.svg": figure for number, figure in drawn.items()}
-    try:
-        results.to_csv(csv)
-        for path, figure in figures.items():
-            figure.savefig(path, metadata={"Date": None})
-    except OSError as error:
-        raise ExperimentError("out", f"{folder} can't be written to: {error.strerror}.") from error
+    results.to_csv(csv)
+    for path, figure in figures.items():
+        figure.savefig(path, metadata={"Date": None})
     return [csv, *figures]

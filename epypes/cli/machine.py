@@ -126,10 +126,7 @@ def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) ->
         click.echo(unit, nl=False)
         return
     file = to / unit_name(bundle, options) if to.is_dir() else to
-    try:
-        file.write_text(unit, encoding="utf-8")
-    except OSError as error:
-        raise ServiceError(file, f"{file} can't be written: {error.strerror or error}.") from error
+    file.write_text(unit, encoding="utf-8")
     click.echo(f"Wrote {file}. What to do with it stands at its top.")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -44,18 +45,14 @@ def record(
     if seconds is not None and seconds > threading.TIMEOUT_MAX:
         text = f"--seconds {seconds:g} is too long: {threading.TIMEOUT_MAX:.0f} at most; without it, Ctrl+C ends it."
         raise RecordingError(file, text)
-    with SignalWait() as signals:
-        recorder = Recorder(address, file, topic, force=force, messages=messages, on_end=signals.now, **access)
-        recorder.start()
-        try:
-            joined = "" if recorder.wait_joined(_JOIN_S) else " (no publisher has confirmed yet)"
-            click.echo(f"RECORDING {recorder.address}{joined} to {file}. Ctrl+C ends it.")
-            signals.wait(seconds)
-        finally:
-            try:
-                recorder.stop(_STOP_S)
-            finally:
-                click.echo(f"RECORDED {file}: {recorder.counts}.")
+    with SignalWait() as signals, ExitStack() as ending:
+        recorder = Recorder(address, file, topic, force=force, messages=messages, on_end=signals.now, **access).start()
+        # In reverse order, the last one also if stopping fails.
+        ending.callback(lambda: click.echo(f"RECORDED {file}: {recorder.counts}."))
+        ending.callback(recorder.stop, _STOP_S)
+        joined = "" if recorder.wait_joined(_JOIN_S) else " (no publisher has confirmed yet)"
+        click.echo(f"RECORDING {recorder.address}{joined} to {file}. Ctrl+C ends it.")
+        signals.wait(seconds)
 
 
 @click.command()
@@ -85,16 +82,12 @@ def play(file: Path, address: str, speed: float, loop: int, wait: bool, only_inf
         return
     if speed == math.inf:
         raise RecordingError(file, "--speed inf is no speed. 0 is as fast as possible.")
-    with SignalWait() as signals:
+    with SignalWait() as signals, ExitStack() as ending:
         player = Player(file, address, speed=speed, loop=loop, wait=wait, on_end=signals.now, **access).start()
-        try:
-            click.echo(f"PLAYING {file} at {player.address}. Ctrl+C ends it.")
-            signals.wait()
-        finally:
-            try:
-                player.stop()
-            finally:
-                click.echo(f"PLAYED {file}: sent {player.sent}.")
+        ending.callback(lambda: click.echo(f"PLAYED {file}: sent {player.sent}."))
+        ending.callback(player.stop)
+        click.echo(f"PLAYING {file} at {player.address}. Ctrl+C ends it.")
+        signals.wait()
 
 
 def _print_info(file: Path) -> None:

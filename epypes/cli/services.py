@@ -39,11 +39,12 @@ if TYPE_CHECKING:
 _ANY_PORT: Final = "tcp://127.0.0.1:*"
 _DIGITS: Final = 12
 
-_http_option: Final = click.option(
-    "--http", default="", show_default=False, help="URL of the service, as http://127.0.0.1:8642."
-)
 _service_option: Final = click.option(
-    "--service", default="", show_default=False, help="Instead of --http: the bundle that the service started with."
+    "--http",
+    "--service",
+    "source",
+    required=True,
+    help="URL of the service, as http://127.0.0.1:8642, or the bundle that it was started with.",
 )
 
 
@@ -195,7 +196,7 @@ def stop(source: str, timeout_s: float, replica: str) -> None:
     late = []
     with ExitStack() as opened:
         # All are ended before the first is waited for.
-        for state, process in [(state, _terminate(source, state, opened)) for state in states]:
+        for state, process in [(state, _terminate(state, opened)) for state in states]:
             if process is None or select.select([process], [], [], max(end_s - monotonic(), 0.0))[0]:
                 named = f", replica {state.replica}" if state.replica else ""
                 click.echo(f"STOPPED {source}{named}, process {state.pid}.")
@@ -205,7 +206,7 @@ def stop(source: str, timeout_s: float, replica: str) -> None:
         raise ServiceError(source, f"{' '.join(late)} has not ended within {timeout_s:g} s. Wait longer: --timeout.")
 
 
-def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | None:
+def _terminate(state: ServiceState, opened: ExitStack) -> int | None:
     """Send SIGTERM to a process; return its file descriptor, or None if it has ended already.
 
     Unlike a process number, the descriptor never means a later process.
@@ -216,9 +217,6 @@ def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | Non
         signal.pidfd_send_signal(process, signal.SIGTERM)
     except ProcessLookupError:
         return None
-    except OSError as error:
-        text = f"Process {state.pid}, which serves {source}, can't be ended: {error.strerror}."
-        raise ServiceError(source, text) from error
     return process
 
 
@@ -255,40 +253,29 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
 
 @click.command()
 @click.argument("bundle", type=PATH, help="Folder of the bundle, on the service's machine.")
-@_http_option
 @_service_option
 @token_file_option
-def deploy(bundle: Path, http: str, service: str, token_file: Path | None) -> None:
+def deploy(bundle: Path, source: str, token_file: Path | None) -> None:
     """Deploy another bundle to a running service.
 
     The service replays the bundle first; if it computes something else, the service keeps the old one.
     """
-    with connect_to(_one_source(http, service), token_file) as connection:
+    with connect_to(source, token_file) as connection:
         before = connection.info()
         click.echo(f"{bundle} is replayed beside {before['bundle']}, which goes on meanwhile.", err=True)
         _print_exchange("DEPLOYED", before, connection.deploy(bundle))
 
 
 @click.command()
-@_http_option
 @_service_option
 @token_file_option
-def rollback(http: str, service: str, token_file: Path | None) -> None:
+def rollback(source: str, token_file: Path | None) -> None:
     """Return a running service to its previous bundle.
 
     A second rollback returns to the bundle before the first.
     """
-    with connect_to(_one_source(http, service), token_file) as connection:
+    with connect_to(source, token_file) as connection:
         _print_exchange("ROLLED BACK", connection.info(), connection.rollback())
-
-
-def _one_source(http: str, service: str) -> str:
-    if bool(http) == bool(service):
-        raise ServiceError("", "Name one service: --http URL, or --service and the bundle that it was started with.")
-    # Anything but a URL is refused as an address, not looked for as a folder.
-    if http and not is_url(http):
-        raise ServiceError(http, f"{http!r:.200} is no address of a service. Write it as http://127.0.0.1:8642.")
-    return http or service
 
 
 def _print_exchange(verb: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -149,11 +149,8 @@ def _print_group(services: list[Info], *, with_members: bool) -> None:
     _print_parameters_and_addresses(first)
     members, lost = _merge_members(services, group)
     bundles = {(member.get("name", ""), member["digest"]) for member in group["members"]}
-    # One broker is away for all of them: its reason is printed once. A lost replica has a reason of its own.
-    known = {_without_addresses(group["trouble"])}
-    reasons = [_new_reasons(member, known) for member in members] + [_new_reasons(member, set()) for member in lost]
-    for member, reason in zip(members + lost, reasons, strict=True):
-        click.echo(_describe_member(member, reason, with_bundle=len(bundles) > 1))
+    for member in members + lost:
+        click.echo(_describe_member(member, group["trouble"], with_bundle=len(bundles) > 1))
 
 
 def _describe_group(service: Info, group: dict[str, Any]) -> str:
@@ -182,22 +179,15 @@ def _merge_members(services: Iterable[Info], group: dict[str, Any]) -> tuple[lis
     return members, lost
 
 
-def _new_reasons(member: Info, known: set[str]) -> str:
-    """Return the reasons for a member's state that are not known yet, and add them."""
-    reasons = []
-    for text in filter(None, (member.get(name) for name in ("reason", "trouble", "silence"))):
-        if _without_addresses(text) not in known:
-            reasons.append(text)
-            known.add(_without_addresses(text))
-    return f" ({' '.join(reasons)})" if reasons else ""
-
-
 def _without_addresses(reason: str) -> str:
     return " ".join(part for part in reason.split() if "://" not in part)
 
 
-def _describe_member(member: Info, reasons: str, *, with_bundle: bool) -> str:
-    parts = [f"{member['state']}{reasons}"]
+def _describe_member(member: Info, trouble: str, *, with_bundle: bool) -> str:
+    """Return the line of a replica; reasons that are the group's trouble too, as an absent broker, are not repeated."""
+    texts = dict.fromkeys(filter(None, (member.get(name) for name in ("reason", "trouble", "silence"))))
+    reasons = " ".join(text for text in texts if _without_addresses(text) != _without_addresses(trouble))
+    parts = [f"{member['state']} ({reasons})" if reasons else member["state"]]
     if "counts" in member:
         parts += [f"{member['counts'].get('answered', 0)} answered", f"revision {member['revision']}"]
     if with_bundle:

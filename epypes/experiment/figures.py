@@ -15,7 +15,6 @@ from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from epypes.experiment.results import PAPER, LogNormal, answered, lognormal_fit
 from epypes.wording import counted
@@ -46,8 +45,6 @@ _SIGMAS_LEFT: Final = 2.5
 _BINS: Final = 60
 # What is beside the outermost mark, as a factor.
 _MARGIN: Final = 1.5
-# On more decades there is no room for numbers at 2 and 5.
-_FEW_DECADES: Final = 3.6
 
 
 class Drawing(Figure):
@@ -192,9 +189,7 @@ def _mark(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -
     low = min(least, mode, paper, _US * float(np.exp(whole.mu - _SIGMAS_LEFT * whole.sigma))) / _MARGIN
     high = max(most, mode, paper) * _MARGIN
     axes.set(xscale="log", xlim=(low, high))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if np.log10(high / low) < _FEW_DECADES else (1,)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda time, _: _number(time)))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_formatter("{x:g}")
 
 
 def _draw_curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import random
 import re
 import time
@@ -59,8 +58,6 @@ _ROWS: Final = sa.Table(
 
 # Kind and name, as JSON texts; keys, rows and descriptions are JSON texts too.
 SeriesKey = tuple[str, str]
-# Device and number of a SQLite file; (0, 0) of the database of a server.
-_Identity = tuple[int, int]
 
 
 def _digest(*texts: str) -> str:
@@ -93,9 +90,8 @@ class Database:
         url = database_url(given)
         self.place = without_password(url)
         self.engine = _create_engine(url)
-        self._is_closed = False
-        # Of the file that has the tables; None until that is known.
-        self._identity: _Identity | None = None
+        self._is_file = url.get_backend_name() == "sqlite"
+        self._is_closed = self._has_tables = False
         # A store that is never closed, as in a notebook, leaves no connection behind.
         weakref.finalize(self, self.engine.dispose)
 
@@ -168,35 +164,18 @@ class Database:
             time.sleep(attempt * _PAUSE_S * random.random())  # noqa: S311 - so that the two don't meet again
 
     def _attempt(self, work: Callable[[sa.Connection], _T]) -> _T:
-        if self._identity not in (None, _identity(self.engine.url)):
-            # Connections to a deleted file would take rows silently.
-            text = (
-                "%s was deleted, moved or replaced while it was open. Later rows are written to the file of that name."
-            )
-            _log.warning(text, self.place)
-            self._identity = None
-        is_new = self._identity is None
         with self.engine.begin() as connection:
-            if is_new:
+            # A file is opened for each transaction, and may have been deleted, moved or replaced since the last one.
+            if not self._has_tables or (self._is_file and not sa.inspect(connection).has_table(_ROWS.name)):
+                if self._has_tables:
+                    _log.warning("%s was deleted, moved or replaced while it was open; it is made anew.", self.place)
                 _METADATA.create_all(connection)
             found = work(connection)
-        if is_new:
-            self._identity = _identity(self.engine.url)
+        self._has_tables = True
         return found
 
 
 # -- URL and connections ----------------------------------------------------------------------------------------------
-
-
-def _identity(url: sa.URL) -> _Identity | None:
-    """Return the identity of the file that is at a path now; None if there is none."""
-    if url.get_backend_name() != "sqlite":
-        return 0, 0
-    try:
-        found = os.stat(str(url.database).removeprefix("file:"))
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
 
 
 def database_url(given: str | Path) -> sa.URL:

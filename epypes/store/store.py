@@ -52,8 +52,8 @@ class Store:
     Notes
     -----
     Any thread may use it, and many processes at the same time. Its tables are made when it is opened; their names
-    begin with ``epypes_``, so it may share a database with others. If a file is deleted, moved or replaced while it is
-    open, the log reports that; later rows are written to the file of that name, made anew if need be.
+    begin with ``epypes_``, so it may share a database with others. If a file is deleted or moved while it is open, the
+    log reports that. Later rows are written to the file of that name, made anew if it is missing.
     """
 
     def __init__(self, place: str | Path) -> None:

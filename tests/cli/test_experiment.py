@@ -74,7 +74,7 @@ def test_a_folder_that_cannot_be_made_is_told_before_anything_runs(epypes, tmp_p
     (tmp_path / "file").write_text("")
     done = epypes("experiment", "--out", tmp_path / "file" / "folder")
     assert done.stderr.startswith("epypes: ")
-    assert "can't be made" in done.stderr
+    assert "folder can't be used: Not a directory." in done.stderr
 
 
 def test_requests_that_failed_are_counted_with_their_reason(epypes, tmp_path):

@@ -63,10 +63,9 @@ ROWS = {
     ],
     "deploy": [
         (["{bundle}", "--http", "http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: "),
-        (["{bundle}"], "Name one service: --http URL, or --service and the bundle"),
         (["{bundle}", "--service", "{bundle}"], "No service of yours runs for {bundle}."),
     ],
-    "rollback": [(["--http", "nonsense"], "'nonsense' is no address of a service. Write it as http://127.0.0.1:8642")],
+    "rollback": [(["--http", "nonsense"], "nonsense does not exist. Name the bundle that is served, or its http URL.")],
     "status": [
         (["{folder}/none"], "{folder}/none does not exist. Name the bundle that is served"),
         (["{bundle}"], "No service of yours runs for {bundle}. Start it: epypes serve {bundle}"),
@@ -178,6 +177,13 @@ def test_a_number_out_of_range_exits_with_2(words, places, epypes):
     done = epypes(*words.format(**places).split())
     assert done.returncode == 2
     assert "Error: Invalid value for '--" in done.stderr
+
+
+@pytest.mark.parametrize("words", ["deploy {bundle}", "rollback"])
+def test_a_service_that_is_not_named_exits_with_2_and_the_options_that_name_it(words, places, epypes):
+    done = epypes(*words.format(**places).split())
+    assert done.returncode == 2
+    assert "Missing option '--http' / '--service'" in done.stderr
 
 
 @pytest.mark.slow
