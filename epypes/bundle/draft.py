@@ -60,5 +60,9 @@ def swap_folders(left: Path, right: Path) -> None:
         return
     aside = left.with_name("old")
     right.rename(aside)
-    left.rename(right)
+    try:
+        left.rename(right)
+    except OSError:
+        aside.rename(right)
+        raise
     aside.rename(left)
