@@ -103,7 +103,7 @@ def _outcome(
     payload: Mapping[str, Any] | None,
     album: Album,
 ) -> Outcome:
-    """Run a job's item with a setting, on a payload or on the last one, and return what comes of it."""
+    """Run a job's item with a setting, on a payload or on the last one, and return its outcome."""
     item, values = job.item, {**varied, **setting}
     before, start_ns = runner.last, perf_counter_ns()
     try:

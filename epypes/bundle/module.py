@@ -18,13 +18,13 @@ from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import ARRAYS, LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.notebook_source import Position, parsed
+from epypes.bundle.objects import without_nodes
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import run_call
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import FullPipeline, Node, Pipeline, SinkPipeline, SourcePipeline
-from epypes.run.guard import as_written
 
 PIPELINES: Final = (Pipeline, SourcePipeline, SinkPipeline, FullPipeline)
 # What the function that makes a pipeline is given, and hands on to the class.
@@ -195,8 +195,7 @@ class Graphs:
 
     def value(self, value: Any, what: str, name: str) -> str:
         """Return the expression of a function, or of an argument that makes one."""
-        while type(value) is Node:  # it does nothing else than call its function
-            value = as_written(value.func)
+        value = without_nodes(value)
         if not isinstance(value, Node):
             return expression_or_none(self.gathered, value, what, _NOT_MADE_AGAIN, name)
         if id(value) not in self._made:

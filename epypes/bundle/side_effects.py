@@ -138,12 +138,7 @@ def check_asked(name: str, found: Definition) -> None:
 
 def check_patches(found: Definition) -> None:
     """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
-    for node in ast.walk(found.node):
-        imported = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
-        if "__main__" in (getattr(node, "module", ""), *imported):
-            text = f"{found.what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
-            raise Refused(f"{text}. Use what it has by its own name, without the module.")
-    known, names = _patches(), {**sys.modules, **found.names}
+    known, names = _patches(), {**sys.modules, **found.names, **_imported_by(found)}
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
@@ -153,25 +148,43 @@ def check_patches(found: Definition) -> None:
             if owner is not None:
                 raise _patched(found.what, f"{owner.__name__}.{name}", place)
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
-    for owner, name in _read_by(found):
+    for owner, name in _read_by(found.node, names):
         if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
             owner, name = of_classes.get(name, (None, name))
-        place = known.get((owner, name), "") or (found.place_in(found.node) if _is_patched(owner, name) else "")
+        place = _place_of_patch(known, owner, name, found.place_in(found.node))
         if place:
             raise _patched(found.what, name if owner is builtins else f"{owner.__name__}.{name}", place)
 
 
 def check_home(module: str, qualname: str, what: str) -> None:
     """Refuse an object that can be imported only as the notebook has changed it."""
-    owner, name = sys.modules[module], qualname.partition(".")[0]
-    place = _patches().get((owner, name), "")
-    if place or _is_patched(owner, name):
-        raise _patched(what, f"{module}.{qualname}", place or "by a name that no text has")
+    name = qualname.partition(".")[0]
+    place = _place_of_patch(_patches(), sys.modules[module], name, "by a name that no text has")
+    if place:
+        raise _patched(what, f"{module}.{qualname}", place)
 
 
 def _patched(what: str, name: str, place: str) -> Refused:
     text = f"{what} uses {name!r}, which the notebook has changed ({place}); a service has it as it was installed"
     return Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
+
+
+def _imported_by(found: Definition) -> dict[str, Any]:
+    """Return what a definition imports itself, by name; refuse the notebook as a module."""
+    names: dict[str, Any] = {}
+    for node in ast.walk(found.node):
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            source = getattr(node, "module", None) or alias.name
+            if "__main__" in (source, alias.name):
+                text = f"{found.what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
+                raise Refused(f"{text}. Use what it has by its own name, without the module.")
+            names[alias.asname or alias.name] = getattr(sys.modules.get(source), alias.name, sys.modules.get(source))
+    return names
+
+
+def _place_of_patch(known: Mapping[tuple[Any, str], str], owner: Any, name: str, otherwise: str) -> str:
+    """Return where the notebook has changed what a module or class has; "" if it has not, ``otherwise`` if unknown."""
+    return known.get((owner, name), "") or (otherwise if _is_patched(owner, name) else "")
 
 
 def _is_patched(owner: Any, name: str) -> bool:
@@ -206,13 +219,9 @@ def _written_in(text: str) -> list[ast.expr]:
     return [written for node in ast.walk(tree) for written in _written(node)] if tree else []
 
 
-def _read_by(found: Definition) -> Iterator[tuple[Any, str]]:
+def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:
     """Give the attributes that a definition reads, also by an import or by getattr, each with what it reads it of."""
-    names = {**sys.modules, **found.names}  # it may import modules itself
-    for node in ast.walk(found.node):
-        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
-            module = sys.modules.get(getattr(node, "module", None) or alias.name)
-            names[alias.asname or alias.name] = getattr(module, alias.name, module)
+    for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             yield from ((sys.modules.get(node.module or ""), alias.name) for alias in node.names)
         for read in (node, *_attribute_of(node, "getattr")):

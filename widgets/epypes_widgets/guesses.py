@@ -1,4 +1,4 @@
-"""Which values may a hyperparameter take that the user gave no hint for?"""
+"""The values that a hyperparameter may take for which the user gave no hint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is a panel made for what a user wants to tune?"""
+"""Making a panel for what a user wants to tune."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is one setting of a sweep chosen by looking at what all of them make?"""
+"""Choosing one setting of a sweep by a click on its picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What becomes of a search of hyperparameters that a panel's button started?"""
+"""A search of hyperparameters that a button of the panel starts."""
 
 from __future__ import annotations
 

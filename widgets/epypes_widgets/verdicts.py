@@ -1,4 +1,4 @@
-"""Which test images pass, with the values that were committed last?
+"""The test images that pass with the values that were committed last.
 
 They are checked on a thread of their own, image by image, when the big picture needs nothing; the newest values always
 win, and a check of older ones is given up.
