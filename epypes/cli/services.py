@@ -179,7 +179,7 @@ def _print_ready(bundle: Path, state: ServiceState) -> None:
         # The token is for the terminal alone: other users may read a log.
         token = Path(state.token_file).read_text(encoding="utf-8").strip() if sys.stdout.isatty() else ""
         page = f"{state.http}/{f'#token={token}' if token else ''}"
-        click.echo(f"Live page: {page} (the token for changes is in {state.token_file})")
+        click.echo(f"Live page: {page} (the access token, for changes, is in {state.token_file})")
 
 
 @click.command()

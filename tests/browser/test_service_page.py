@@ -319,7 +319,7 @@ def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_pau
         page.locator("#token").fill("x" * 43)
         page.locator("#token-form button").click()
         page.wait_for_selector("#notice:not([hidden])")
-        assert "not the service's access key" in page.locator("#notice").text_content()
+        assert "not the service's access token" in page.locator("#notice").text_content()
         assert page.locator("#pause").is_disabled()
         page.locator("#token").fill(http.token)
         page.locator("#token-form button").click()

@@ -59,7 +59,7 @@ def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Co
     url
         Its address, as ``http://127.0.0.1:8642``; the address of its page does too.
     token
-        The token for changes. Without: that of the address, that of EPYPES_TOKEN, or, for a service of this user on
+        The access token. Without: that of the address, that of EPYPES_TOKEN, or, for a service of this user on
         this machine, the one in its token file. Reading needs none.
     timeout_s
         How long an answer may take, in seconds.
