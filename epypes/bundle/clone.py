@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final, TypeGuard
 
 from epypes.bundle.expressions import is_same_data
-from epypes.bundle.notebook_source import nested_codes
+from epypes.bundle.references import nested_codes
 from epypes.bundle.resolve import Refused, functions_of
 from epypes.graph import CompGraph, with_defaults, with_functions
 from epypes.pipeline import Node, Pipeline

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
+from epypes.bundle.arrays import StoredArray, read_array
 from epypes.bundle.manifest import bundle_files, check_manifest
 from epypes.bundle.mutable_state import MutableState
-from epypes.bundle.settings import Settings, StoredArray, load_array, read_settings
+from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
 from epypes.pipeline import FullPipeline
@@ -92,12 +93,12 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
                 raise BundleError(folder, f"{folder} has no {MODULE}. Promote the graph again.")
             for file in files:
                 if file.endswith(".npy"):
-                    load_array(folder / file, "r")
+                    read_array(folder / file, "r")
             module = execute(folder / MODULE, (folder / MODULE).read_bytes())
             enums = getattr(module, "enums", {})
             settings = read_settings(folder / SETTINGS, enums)
             values = {
-                token: load_array(folder / value.file) if type(value) is StoredArray else value
+                token: read_array(folder / value.file) if type(value) is StoredArray else value
                 for token, value in settings.hyperparameters.items()
             }
         except Exception:  # whatever the module's own code raises

@@ -13,13 +13,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import arguments_of, parameters_of
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import ARRAYS, LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
+from epypes.bundle.expressions import LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.notebook_source import Position, parsed
 from epypes.bundle.objects import without_nodes
-from epypes.bundle.resolve import Refused
+from epypes.bundle.resolve import Position, Refused, parsed
 from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import run_call
@@ -52,8 +52,8 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 
 def write_module(
     cg: CompGraph, settings: Settings, ports: Mapping[str, Callable[..., Any]], pipeline: Pipeline | None
-) -> tuple[str, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the arrays that it reads by file, and the reasons against it.
+) -> tuple[str, ArrayFiles, list[str]]:
+    """Return the text of ``pipeline.py``, the arrays that it reads from files, and the reasons against it.
 
     Parameters
     ----------
@@ -91,11 +91,10 @@ def write_module(
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
     gathered, references = gather(write, reserved, stores_arrays=True)
     if gathered.refusals:
-        return "", {}, list(dict.fromkeys(gathered.refusals))
-    arrays = {f"{ARRAYS}/{name}.npy": array for name, array in gathered.arrays.items()}
+        return "", gathered.arrays, list(dict.fromkeys(gathered.refusals))
     module = emit_module(settings, cg, gathered, references)
-    why = refusal(module, arrays, functools.partial(_pairs, cg, ports, pipeline, enums))
-    return module, arrays, [why] if why else []
+    why = refusal(module, functools.partial(_pairs, cg, ports, pipeline, enums), gathered.arrays)
+    return module, gathered.arrays, [why] if why else []
 
 
 def _pairs(

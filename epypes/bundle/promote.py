@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
+from epypes.bundle.arrays import store_hyperparameters
 from epypes.bundle.clone import clone_runner, parameters_of
 from epypes.bundle.determinism import prove
 from epypes.bundle.draft import draft_folder, swap_folders
-from epypes.bundle.expressions import write_arrays
 from epypes.bundle.load import MAKER, MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import Settings, store_arrays, unwritable, writable_defaults, write_settings
+from epypes.bundle.settings import MOST_NUMBERS, Settings, unwritable, writable_defaults, write_settings
 from epypes.errors import EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import colour_order
 from epypes.pipeline import Pipeline
@@ -135,7 +135,7 @@ def _write(
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
-    hyperparameters, stored = store_arrays(runner.hyperparameters)
+    hyperparameters, stored = store_hyperparameters(runner.hyperparameters, MOST_NUMBERS)
     free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
     pipeline = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None
@@ -151,7 +151,8 @@ def _write(
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
-    write_arrays(draft, {**arrays, **stored})
+    arrays.write(draft)
+    stored.write(draft)
     for number, run in enumerate(runs):
         _record(draft / SAMPLES / f"{number:03}.npz", run, settings, ports.get("f_out"))
 

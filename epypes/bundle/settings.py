@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import enum
 import math
-import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
+from epypes.bundle.arrays import StoredArray
 from epypes.bundle.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
@@ -30,7 +30,6 @@ from epypes.run.guard import is_plain_array
 # What a person still reads, and a line of a diff still shows.
 MOST_NUMBERS: Final = 400
 FORMAT: Final = 1
-_ARRAYS: Final = "hyperparameters"
 _KIND: Final = "kind"
 _SMALL: Final = range(-(2**63), 2**63)
 _LINE: Final = 100
@@ -276,50 +275,6 @@ class Member:
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class StoredArray:
-    """An array that is a file of the bundle, known by its name alone where the files are not read."""
-
-    file: str
-
-
-def store_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return values with a StoredArray for each array that is too large for text, and the arrays by file.
-
-    Parameters
-    ----------
-    values
-        Hyperparameters by token.
-    """
-    after, arrays = dict(values), {}
-    for token, value in values.items():
-        if is_plain_array(value) and value.dtype.kind in "biufc" and value.size > MOST_NUMBERS:
-            file = f"{_ARRAYS}/{re.sub(r'[^0-9A-Za-z_]', '_', token)}.npy"
-            while file in arrays:
-                file = f"{file.removesuffix('.npy')}_.npy"
-            after[token], arrays[file] = StoredArray(file), value
-    return after, arrays
-
-
-def load_array(path: Path, mmap_mode: Literal["r"] | None = None) -> Any:
-    """Return an array of a bundle, which can't be written to.
-
-    Raises
-    ------
-    BundleError
-        The file holds no array, or a part of one.
-    """
-    import numpy as np
-
-    try:
-        array = np.load(path, mmap_mode, allow_pickle=False)
-        array.flags.writeable = False
-    except Exception as error:  # a broken header raises errors of many kinds
-        text = f"{path} is no array that NumPy can read: {error}. Promote the graph again."
-        raise BundleError(path, text) from error
-    return array
-
-
 def alike(entry: Mapping[str, Any], value: Any) -> Any:
     """Return a number as one of the kind that an entry has: NumPy's of its dtype, else Python's own."""
     number = plain(value)
@@ -476,11 +431,9 @@ def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> An
     if kind == "enum":
         name = entry["enum"]
         return enums[name][value] if enums and name in enums else Member(name, value)
-    if kind != "file":
-        raise TypeError(f"no value has the kind {kind!r}")
-    if not isinstance(value, str) or not re.fullmatch(rf"{_ARRAYS}/\w+\.npy", value):
-        raise TypeError(f"{value!r} is no file of {_ARRAYS}/")
-    return StoredArray(value)
+    if kind == "file":
+        return StoredArray(value)
+    raise TypeError(f"no value has the kind {kind!r}")
 
 
 def _of_numpy(kind: str, value: Any, entry: Mapping[str, Any]) -> Any:

@@ -14,15 +14,17 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
-from epypes.bundle.notebook_source import (
+from epypes.bundle.references import global_names, namespace_of
+from epypes.bundle.resolve import (
+    Definition,
+    Refused,
     definition_of,
+    evaluated,
     executed_cells,
-    names_from_outside,
-    nested_codes,
+    is_of_notebook,
     parsed,
     place_in,
 )
-from epypes.bundle.resolve import Definition, Refused, captured_by, evaluated, is_of_notebook
 from epypes.run.guard import is_plain_array
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
@@ -45,7 +47,7 @@ def check_state(found: Definition) -> None:
         for function in (evaluated(called, found.names), wrapper):
             node = definition_of(function.__code__)[1] if is_of_notebook(function) else None
             if node is not None:
-                _check_writes(node, function.__code__.co_filename, function, f"{what} {node.name!r}")
+                _check_writes(node, function.__code__.co_filename, function, f"{what} {function.__code__.co_name!r}")
     _check_writes(found.node, found.file, found.function, found.what)
 
 
@@ -53,9 +55,8 @@ def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None,
     """Refuse writes to names and objects from outside of a function; of a class, to global names alone."""
     outside, names = set[str](), dict[str, Any]()
     if function is not None:
-        names = {**function.__globals__, **captured_by(function)}
-        codes = nested_codes(function.__code__)
-        outside = {*function.__code__.co_freevars, *(name for code in codes for name in names_from_outside(code))}
+        names = namespace_of(function)
+        outside = {*function.__code__.co_freevars, *global_names(function.__code__)}
     parts = [*ast.walk(node)]
     stored = {part.id: part for part in parts if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load)}
     for part in parts:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, TypeVar
 
+from epypes.bundle.arrays import CONSTANTS, READER, ArrayFiles, is_storable, reader_text
 from epypes.bundle.expressions import (
     LINE,
     UNKNOWN,
@@ -34,24 +35,21 @@ from epypes.bundle.expressions import (
     names_in,
     quoted,
 )
-from epypes.bundle.notebook_source import (
-    LATE_ANNOTATIONS,
-    Position,
-    assignment_of,
-    cell_of,
-    comment_above,
-    names_from_outside,
-    names_of,
-)
 from epypes.bundle.resolve import (
+    LATE_ANNOTATIONS,
     Definition,
     Importable,
+    Position,
     Refused,
     annotated_names,
+    assignment_of,
+    cell_of,
     class_definition,
+    comment_above,
     evaluated,
     function_definition,
     importable,
+    names_of,
     with_defaults,
 )
 from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state
@@ -91,7 +89,7 @@ class Slice:
     read
         What functions read by name: these names are theirs alone.
     arrays
-        The arrays that are stored in files, by name.
+        The arrays that are stored in files.
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
@@ -109,8 +107,7 @@ class Slice:
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
-        self.stores_arrays = stores_arrays
-        self.arrays: dict[str, Any] = {}
+        self.arrays = ArrayFiles(CONSTANTS)
         self.read: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, Constant] = {}
@@ -119,6 +116,7 @@ class Slice:
         self.reads: dict[str, frozenset[str]] = {}
         self.closures: set[str] = set()
         self.refusals: list[str] = []
+        self._stores_arrays = stores_arrays
         self._reserved = reserved
         self._meanings: dict[str, Meaning] = {}
         self._known: dict[int, str] = {}
@@ -203,6 +201,16 @@ class Slice:
         else:
             self.claim(name, _of_object(sys.modules.get(module)), what)
             self.imports[name, module] = f"import {module} as {name}"
+
+    def store_array(self, array: Any, name: str, what: str) -> str:
+        """Store an array as a file; return the call that reads it, or "" if files can't hold it or there are none."""
+        if not self._stores_arrays or not is_storable(array):
+            return ""
+        if READER not in self.definitions:
+            self.reserve(READER)
+            self.definitions[READER] = reader_text(*(self.module_name(module, what) for module in ("numpy", "pathlib")))
+            self.reads[READER] = frozenset()
+        return f'{READER}("{self.arrays.add(array, name)}")'
 
     # -- functions and classes ---------------------------------------------------------------------------------------
 
@@ -323,8 +331,8 @@ class Slice:
         """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
         check_patches(found)
-        read = dict.fromkeys(each for code in found.codes() for each in names_from_outside(code))
-        self.reads[name] = frozenset(read.keys() - {*own})
+        read = found.reads()
+        self.reads[name] = frozenset(read) - {*own}
         for needed in read:
             if needed not in own:
                 with self.noted_refusals():

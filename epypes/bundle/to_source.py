@@ -168,7 +168,7 @@ class _Module:
         def pairs(module: Any) -> list[Pair]:
             return [(what, ours, made) for (what, ours, _), made in zip(self.compared, module.references, strict=True)]
 
-        return refusal(f"{text}references = [{sources}]\n", {}, pairs)
+        return refusal(f"{text}references = [{sources}]\n", pairs)
 
 
 def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dict[str, Region], list[str]]:

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, fields, replace
 from time import time_ns
 from typing import Any, Final
 
-from epypes.bundle.settings import StoredArray, read
+from epypes.bundle.arrays import StoredArray
+from epypes.bundle.settings import read
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"

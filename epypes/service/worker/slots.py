@@ -18,8 +18,9 @@ from time import perf_counter_ns
 from typing import Any, Final
 
 import epypes
+from epypes.bundle.arrays import StoredArray
 from epypes.bundle.load import Bundle, pipeline_of
-from epypes.bundle.settings import Member, StoredArray, read
+from epypes.bundle.settings import Member, read
 from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline
 from epypes.pipeline.answering import Answering
