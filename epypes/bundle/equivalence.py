@@ -27,9 +27,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.arrays import ArrayFiles
-from epypes.bundle.clone import is_set_elsewhere
+from epypes.bundle.clone import is_set_by_runs
 from epypes.bundle.expressions import is_data
-from epypes.bundle.load import MODULE, execute
+from epypes.bundle.load import execute
+from epypes.bundle.manifest import MODULE
 from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, without_nodes
 from epypes.bundle.references import meanings_of, nested_codes
 from epypes.bundle.resolve import (
@@ -184,7 +185,7 @@ class _Walk:
             path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours))
         elif isinstance(ours, Node):
             nodes = ours, theirs
-            names = [name for node in nodes for name in vars(node) if is_set_elsewhere(node, name)]
+            names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
 

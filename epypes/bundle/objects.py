@@ -120,7 +120,7 @@ def atom_content(value: Any) -> str | bytes:
 
 
 def without_nodes(value: Any) -> Any:
-    """Return the function of a node that does nothing else than call it; anything else as the notebook wrote it."""
+    """Return the function of a plain node; anything else, also a node of the user's own class, as it was written."""
     value = as_written(value)
     while type(value) is Node:
         value = as_written(value.func)
@@ -344,17 +344,17 @@ def _library_object(value: Any) -> Description:
             raise TypeError(f"{made!r} can't be found in {module!r}")
         return Description("global", (module, made), module=module)
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]
-    parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _lasting(kind, state))]
+    parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _without_computed(kind, state))]
     parts += [(" items", [*(items or ())]), (" entries", [*(pairs or ())])]
     # A method of an object is no state, but the object is.
     is_state = not isinstance(value, types.BuiltinFunctionType)
     return Description(kind.__name__, parts=parts, is_state=is_state, is_pickled=True)
 
 
-def _lasting(kind: type, state: Any) -> Any:
+def _without_computed(kind: type, state: Any) -> Any:
     """Return a state without what is computed from the rest when it is first needed."""
     if type(state) is tuple and len(state) == 2 and type(state[0]) is dict:
-        return _lasting(kind, state[0]), state[1]
+        return _without_computed(kind, state[0]), state[1]
     computed = {*cached_properties(kind), *({"_ufunc"} if (kind.__module__, kind.__name__) == _VECTORIZE else ())}
     return (
         {name: state[name] for name in sorted(state, key=str) if name not in computed} if type(state) is dict else state

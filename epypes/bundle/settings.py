@@ -118,7 +118,7 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
     last = "unfreeze it and pass it to run()" if what == "Hyperparameter" else "leave it out"
     for token, value in values.items():
         try:
-            written(value)
+            encode_value(value)
         except Unwritable as error:
             reasons.append(f"{what} {token!r} {error.reason}; or {last}.")
     return reasons
@@ -152,7 +152,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
                 takers = ", ".join(cg.digraph.consumers.get(name, ()))
                 tables.add(name, _table(_entry_of(cg, name, value), f"Taken by {takers}."))
             else:
-                tables.add(name, _table(written(value)))
+                tables.add(name, _table(encode_value(value)))
         if tables:
             document.add(section, tables)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
@@ -183,7 +183,7 @@ def _table(entries: Mapping[str, Any], comment: str = "") -> Any:
 
 def _entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
     """Return what stands in pipeline.toml of a hyperparameter: its value, and the range that it may take."""
-    entry = written(value)
+    entry = encode_value(value)
     hint = range_of(cg, token, value)
     if not isinstance(hint, Param):
         return entry
@@ -201,12 +201,12 @@ def _entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
 def _is_limit(limit: Any) -> bool:
     """Whether TOML has a limit as a number; it may have no infinite one."""
     number = plain(limit)
-    return type(number) in (int, float) and math.isfinite(number) and _KIND not in written(number)
+    return type(number) in (int, float) and math.isfinite(number) and _KIND not in encode_value(number)
 
 
 def _choice(choice: Any, entry: Mapping[str, Any]) -> Any:
     """Return a choice as it stands in the place of an entry's value; whole if it is of another kind."""
-    own = written(choice)
+    own = encode_value(choice)
     same = all(own.get(key) == entry.get(key) for key in (_KIND, "dtype", "shape", "enum"))
     return own["value"] if (same or _KIND not in own) and "value" in own else own
 
@@ -261,7 +261,7 @@ def _strings(values: Sequence[Any]) -> tuple[str, ...]:
 
 
 def _values(entries: Mapping[str, Any], enums: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {token: read(entry, enums) for token, entry in entries.items()}
+    return {token: decode_value(entry, enums) for token, entry in entries.items()}
 
 
 # -- values ----------------------------------------------------------------------------------------------------------
@@ -275,7 +275,7 @@ class Member:
     name: str
 
 
-def alike(entry: Mapping[str, Any], value: Any) -> Any:
+def cast_like(entry: Mapping[str, Any], value: Any) -> Any:
     """Return a number as one of the kind that an entry has: NumPy's of its dtype, else Python's own."""
     number = plain(value)
     if entry.get(_KIND) != "numpy" or not isinstance(number, bool | int | float):
@@ -290,7 +290,7 @@ def fits(value: Any) -> bool:
     return not unwritable({"": value})
 
 
-def written(value: Any) -> dict[str, Any]:
+def encode_value(value: Any) -> dict[str, Any]:
     """Return the entry of a value: ``value``, with its ``kind`` and what else that needs where TOML has none like it.
 
     Raises
@@ -299,12 +299,12 @@ def written(value: Any) -> dict[str, Any]:
         There is no entry for a value of this kind, or of this size.
     """
     try:
-        return _written(value)
+        return _encode(value)
     except RecursionError:
         raise Unwritable("nested too deep") from None
 
 
-def _written(value: Any) -> dict[str, Any]:
+def _encode(value: Any) -> dict[str, Any]:
     kind = type(value)
     if value is None:
         return {_KIND: "none"}
@@ -321,10 +321,10 @@ def _written(value: Any) -> dict[str, Any]:
     for name, (python_type, write, _) in _KINDS.items():
         if kind is python_type:
             return {"value": write(value), _KIND: name}
-    return _written_by_name(value)
+    return _encode_by_name(value)
 
 
-def _written_by_name(value: Any) -> dict[str, Any]:
+def _encode_by_name(value: Any) -> dict[str, Any]:
     """Return the entry of a value that names its dtype, its enumeration or its file."""
     numpy = sys.modules.get("numpy")
     if is_plain_array(value):
@@ -356,7 +356,7 @@ def _array(array: Any) -> dict[str, Any]:
     dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
     entry = {"value": numbers.reshape(array.shape).tolist(), _KIND: "array", "dtype": dtype}
     entry |= {} if array.size else {"shape": list(array.shape)}
-    if read(entry).tobytes() != array.tobytes():
+    if decode_value(entry).tobytes() != array.tobytes():
         raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
     return entry
 
@@ -372,7 +372,7 @@ def _of_number(number: Any) -> Any:
 
 def _part(value: Any) -> Any:
     """Return a value as it stands inside a list or table."""
-    entry = _written(value)
+    entry = _encode(value)
     return entry if _KIND in entry else entry["value"]
 
 
@@ -396,13 +396,13 @@ _KINDS: Final[Mapping[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any
 }
 
 
-def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
+def decode_value(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
     """Return the value of an entry.
 
     Parameters
     ----------
     entry
-        What :func:`written` returned; other keys are passed over.
+        What :func:`encode_value` returned; other keys are passed over.
     enums
         The enumerations by name. Members of others are read as :class:`Member`.
 
@@ -450,7 +450,7 @@ def _whole(part: Any, enums: Mapping[str, Any] | None) -> Any:
     """Return a value that stands inside a list or table."""
     if isinstance(part, dict):
         if _KIND in part:
-            return read(part, enums)
+            return decode_value(part, enums)
         return {key: _whole(item, enums) for key, item in part.items()}
     return [_whole(item, enums) for item in part] if isinstance(part, list) else part
 

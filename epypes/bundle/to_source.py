@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from typing import Any, Final
 
-from epypes.bundle.clone import called_by, is_plain_pipeline
+from epypes.bundle.clone import is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import (
     LINE,
@@ -21,6 +21,7 @@ from epypes.bundle.expressions import (
     names_in,
 )
 from epypes.bundle.module import module_text
+from epypes.bundle.objects import without_nodes
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, Switch, as_switch
@@ -250,7 +251,7 @@ class _Function:
 
     def _call(self, name: str) -> str:
         """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
-        module, function = self.module, called_by(self.cg.functions[name])
+        module, function = self.module, without_nodes(self.cg.functions[name])
         if not is_plain_pipeline(function):
             return module.expression(f"Function {name!r}{self.where}", function, _NO_EXPRESSION, name)
         if id(function) not in module.pipelines:

@@ -11,7 +11,7 @@ from time import time_ns
 from typing import Any, Final
 
 from epypes.bundle.arrays import StoredArray
-from epypes.bundle.settings import read
+from epypes.bundle.settings import decode_value
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"
@@ -162,7 +162,7 @@ def values_of(
     values, gone = {}, []
     for token, entry in record.hyperparameters.items():
         try:
-            value = read(entry, enums)
+            value = decode_value(entry, enums)
         except (LookupError, TypeError, ValueError):
             gone.append(token)
             continue
