@@ -376,6 +376,15 @@ class Definition:
         code = compiled(ast.Module([node], []))
         return global_names(code) if code is not None else []
 
+    def factory(self) -> ast.FunctionDef | None:
+        """Return the definition of the function that has returned it; None for one that stands at the margin."""
+        qualname = self.function.__code__.co_qualname if self.function is not None else ""
+        name = qualname.rpartition(".<locals>")[0].rpartition(".")[2]
+        tree = parsed("".join(self.lines)) if name else None
+        nodes = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)] if tree else []
+        around = (node for node in nodes if node.name == name and node.lineno <= self.line <= (node.end_lineno or 0))
+        return max(around, key=lambda node: node.lineno, default=None)
+
     def place_in(self, node: ast.AST) -> str:
         """Return the cell and line of a part of it."""
         return place_in(self.file, getattr(node, "lineno", self.line))

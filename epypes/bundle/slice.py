@@ -13,7 +13,7 @@ import re
 import sys
 import tokenize
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -47,6 +47,7 @@ from epypes.bundle.resolve import (
     class_definition,
     comment_above,
     evaluated,
+    first_line,
     function_definition,
     importable,
     names_of,
@@ -273,13 +274,15 @@ class Slice:
 
     def _write_closure(self, name: str, inner: str, given: Mapping[str, str], found: Definition) -> None:
         """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
-        whole = f"({', '.join(given)}):\n{_text(found, inner, depth=1)}\n    return {inner}\n"
-        qualname = found.function.__code__.co_qualname if found.function else ""
-        around = qualname.rpartition(".<locals>")[0].rpartition(".")[2] or f"make_{inner}"
+        node = found.factory()
+        around = node.name if node is not None else f"make_{inner}"
+        docstring = _docstring(node, found.lines) if node is not None else ""
+        whole = f"({', '.join(given)}):\n{docstring}{_text(found, inner, depth=1)}\n    return {inner}\n"
         if (around, whole) not in self._makers:
             self._makers[around, whole] = factory = identifier_of(around, self.is_taken)
             self.claim(factory, ("closure", whole), found.what)
-            self._write(factory, f"def {factory}{whole}", found, {*given, inner})
+            above = comment_above(found.lines, first_line(node)) if node is not None else []
+            self._write(factory, "\n".join([*above, f"def {factory}{whole}"]), found, {*given, inner})
         arguments = ", ".join(f"{each}={source}" for each, source in given.items())
         self.definitions[name] = f"{name} = {self._makers[around, whole]}({arguments})\n"
         self.positions[name] = _position(found)
@@ -427,6 +430,13 @@ def _text(found: Definition, name: str, depth: int = 0) -> str:
             # Comments and what is in brackets may stand before the margin.
             lines[number] = re.sub(rf"\s{{0,{margin}}}", pad, line, count=1) if line.strip() else "\n"
     return above + "".join(lines[first : node.end_lineno]).rstrip() + "\n"
+
+
+def _docstring(node: ast.FunctionDef, lines: Sequence[str]) -> str:
+    """Return the lines of the docstring of a function at the margin; "" if it has none."""
+    if ast.get_docstring(node, clean=False) is None:
+        return ""
+    return f"    {ast.get_source_segment(''.join(lines), node.body[0])}\n\n"
 
 
 def _lines_in_strings(text: str) -> set[int]:
