@@ -47,7 +47,8 @@ from epypes.run import CompGraphRunner
 
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
-    "The bundle would have what the text of the cells makes. Run the cells that make it again, or make it a token."
+    "The bundle has what the text of the cells makes. Run the cells that make it again, then promote; or pass it in as "
+    "a token."
 )
 
 

@@ -347,10 +347,12 @@ def _execute_notebook(
     try:
         document = nbformat.read(path, as_version=4)
     except OSError as error:
-        raise BundleError(path, f"Notebook {path} can't be read: {error.strerror or error}.") from error
+        text = f"Notebook {path} can't be read: {error.strerror or error}. Name an .ipynb file that is there."
+        raise BundleError(path, text) from error
     except Exception as error:  # nbformat raises its own and json's errors for what is no notebook
         reason = f"{type(error).__name__}: {error}".replace("\n", " ")[:120]
-        raise BundleError(path, f"{path} is not a notebook that Jupyter opens: {reason}") from error
+        text = f"{path} is not a notebook that Jupyter opens ({reason}). Name an .ipynb file that it does."
+        raise BundleError(path, text) from error
     total = sum(cell.cell_type == "code" for cell in document.cells)
     document.cells.append(nbformat.v4.new_code_cell(last_cell))
     done = 0
@@ -375,9 +377,11 @@ def _execute_notebook(
             client.execute()
         except CellExecutionError as error:
             text = f"{path}: code cell {done} of {total} raised {error.ename}: {error.evalue}"
-            raise BundleError(path, text) from error
+            way_out = "Change it so that all cells run from top to bottom."
+            raise BundleError(path, f"{text.rstrip('.')}. {way_out}") from error
         except DeadKernelError as error:
-            raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
+            text = f"{path}: the kernel died in code cell {done + 1} of {total}. Run that cell in Jupyter to see why."
+            raise BundleError(path, text) from error
 
 
 def promote_here(name: str, to: str, outputs: Sequence[str] | None, samples: Sequence[str]) -> None:

@@ -230,7 +230,8 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         document = tomllib.loads(path.read_text(encoding="utf-8"))
         bundle, ports = document["bundle"], document["ports"]
         if bundle["format"] != FORMAT:
-            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
+            text = f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}. Promote the graph again"
+            raise BundleError(path, f"{text}, or use the EPypes that wrote it.")
         entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),
@@ -249,7 +250,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise BundleError(path, f"{path} can't be read: {error}.") from error
+        raise BundleError(path, f"{path} can't be read: {error}. Promote the graph again.") from error
 
 
 def _strings(values: Sequence[Any]) -> tuple[str, ...]:

@@ -53,7 +53,14 @@ from epypes.bundle.resolve import (
     names_of,
     with_defaults,
 )
-from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state
+from epypes.bundle.side_effects import (
+    CHANGING,
+    check_home,
+    check_notebook_name,
+    check_patches,
+    check_state,
+    patches_in_notebook,
+)
 from epypes.run.guard import is_plain_array
 
 T = TypeVar("T")
@@ -124,6 +131,7 @@ class Slice:
         self._unfinished: set[str] = set()
         self._makers: dict[tuple[str, str], str] = {}
         self._notebook: Mapping[str, Any] = {}
+        self._patches = patches_in_notebook()
 
     @contextmanager
     def noted_refusals(self) -> Iterator[None]:
@@ -176,7 +184,7 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
-        check_home(home.module, home.qualname, what)
+        check_home(home.module, home.qualname, what, self._patches)
         top = home.qualname.partition(".")[0]
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
@@ -333,7 +341,7 @@ class Slice:
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
         """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
-        check_patches(found)
+        check_patches(found, self._patches)
         read = found.reads()
         self.reads[name] = frozenset(read) - {*own}
         for needed in read:
@@ -347,7 +355,7 @@ class Slice:
 
     def _add_name(self, name: str, found: Definition, what: str) -> None:
         """Add what one global name of a definition means at the time of promotion."""
-        check_asked(name, found)
+        check_notebook_name(name, found)
         if name not in found.names:
             self._add_builtin(name, found)
             return
@@ -361,7 +369,7 @@ class Slice:
         written = literal_source(value)
         home = importable(value, name) if not written or not is_short(written) else None
         if home is not None and "." not in home.qualname:  # a nested name can't be imported by itself
-            check_home(home.module, home.qualname, what)
+            check_home(home.module, home.qualname, what, self._patches)
             self.claim(name, _of_object(value), what)
             alias = "" if name == home.qualname else f" as {name}"
             self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
