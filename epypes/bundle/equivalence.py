@@ -46,7 +46,9 @@ from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
 
 _DRAFT: Final = "epypes-draft-"
-_WAY_OUT: Final = "The bundle has what the text of the cells makes. Run the cells that make it again, then promote; or make it a token."
+_WAY_OUT: Final = (
+    "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token."
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
