@@ -23,8 +23,9 @@ from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
 from epypes.bundle.fingerprint import combined_digest
-from epypes.bundle.load import SAMPLES, Bundle, read_bundle
-from epypes.bundle.settings import Unwritable, members_in, read, written
+from epypes.bundle.load import Bundle, read_bundle
+from epypes.bundle.manifest import REQUIREMENTS, SAMPLES
+from epypes.bundle.settings import Unwritable, decode_value, encode_value, members_in
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.branch import branched
@@ -158,7 +159,7 @@ def packed(value: Any, what: str) -> Any:
         return value
     try:
         if any(members_in(value)):
-            return TomlValue(written(value))
+            return TomlValue(encode_value(value))
         return WireValue(tuple(bytes(frame) for frame in encode(Envelope(_PART, {_PART: value}))))
     except (MessageError, Unwritable) as error:
         way_out = "Use a ThreadPoolExecutor, or none, where values stay in this process."
@@ -169,7 +170,7 @@ def unpacked(value: Any, enums: Mapping[str, Any] | None = None) -> Any:
     """Return the value that ``packed`` packed."""
     if isinstance(value, WireValue):
         return decode(value.frames).parts[_PART]
-    return read(value.written, enums) if isinstance(value, TomlValue) else value
+    return decode_value(value.written, enums) if isinstance(value, TomlValue) else value
 
 
 def packed_values(values: Mapping[str, Any], what: str) -> dict[str, Any]:
@@ -292,8 +293,9 @@ def _unpacked(files: Mapping[str, bytes]) -> Bundle:
 
 def _load_error(files: Mapping[str, bytes], error: BaseException) -> str:
     where = f"Worker process {os.getpid()} on {socket.gethostname()}"
-    requirements = files.get("requirements.txt", b"").decode()
+    requirements = files.get(REQUIREMENTS, b"").decode()
     needs = ", ".join(line for line in requirements.splitlines() if line and not line.startswith("#"))
     way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
-    reason = ended(f"{type(error).__name__}: {error}")
+    cause = error.__cause__ if isinstance(error.__cause__, ImportError) else error
+    reason = ended(f"{type(cause).__name__}: {cause}")
     return f"{where} can't load the graph: {reason} {way_out}; or use an executor of this machine."

@@ -22,8 +22,7 @@ from typing import Final
 
 from epypes.bundle.adapters import ANSWER
 from epypes.bundle.compare import Difference, add_tolerances
-from epypes.bundle.load import MODULE, SAMPLES, SETTINGS
-from epypes.bundle.manifest import write_manifest
+from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, write_manifest
 from epypes.bundle.replay import (
     PRINT_OPTIONS,
     REPLAY_TIMEOUT_S,
@@ -33,7 +32,6 @@ from epypes.bundle.replay import (
     replay_isolated,
     without_python,
 )
-from epypes.bundle.requirements import REQUIREMENTS
 from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError, PromotionRefused
 from epypes.optional import optional_import

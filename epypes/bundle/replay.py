@@ -27,16 +27,17 @@ from typing import Any, Final
 from epypes.bundle.adapters import ANSWER, answer_of
 from epypes.bundle.compare import Difference, difference, differences, largest_of
 from epypes.bundle.fingerprint import Digester
-from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
-from epypes.bundle.manifest import check_manifest, environment, environment_differences, recorded_environment
-from epypes.bundle.requirements import (
+from epypes.bundle.load import Bundle, pipeline_of, read_bundle
+from epypes.bundle.manifest import (
+    MODULE,
     REQUIREMENTS,
-    fresh_environment,
-    imported_names,
-    pins,
-    read_pins,
-    requirement_lines,
+    SAMPLES,
+    check_manifest,
+    environment,
+    environment_differences,
+    recorded_environment,
 )
+from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -304,7 +305,8 @@ def main(arguments: Sequence[str]) -> int:
         report = record_again(read_bundle(folder, compare=False)) if "--record" in arguments else _watched(folder)
         outcome = asdict(report)
     except EpypesError as error:
-        outcome = {"error": str(error)}
+        cause = error.__cause__
+        outcome = {"error": _describe(cause, folder) if isinstance(cause, ImportError) else str(error)}
     except BaseException as error:
         outcome = {"error": _describe(error, folder)}
     out.write_text(json.dumps(outcome), encoding="utf-8")
@@ -500,7 +502,7 @@ def named_here(folder: Path) -> list[str]:
 
 def _texts_of(folder: Path) -> Iterator[tuple[str, str]]:
     """Give the strings in a bundle's module with the function that has each; not those that nothing reads."""
-    module = folder / "pipeline.py"
+    module = folder / MODULE
     tree = ast.parse(module.read_bytes())
     functions: dict[ast.AST, str] = {}
     unread: set[ast.AST] = set()

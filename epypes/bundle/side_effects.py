@@ -14,16 +14,21 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
-from epypes.bundle.notebook_source import (
+from epypes.bundle.references import global_names, namespace_of
+from epypes.bundle.resolve import (
+    Definition,
+    Refused,
     definition_of,
+    evaluated,
     executed_cells,
-    names_from_outside,
-    nested_codes,
+    is_of_notebook,
     parsed,
     place_in,
 )
-from epypes.bundle.resolve import Definition, Refused, captured_by, evaluated, is_of_notebook
 from epypes.run.guard import is_plain_array
+
+# By module or class of a library and the name there: the place in the notebook that changes it.
+Patches = Mapping[tuple[Any, str], str]
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
 
@@ -45,7 +50,7 @@ def check_state(found: Definition) -> None:
         for function in (evaluated(called, found.names), wrapper):
             node = definition_of(function.__code__)[1] if is_of_notebook(function) else None
             if node is not None:
-                _check_writes(node, function.__code__.co_filename, function, f"{what} {node.name!r}")
+                _check_writes(node, function.__code__.co_filename, function, f"{what} {function.__code__.co_name!r}")
     _check_writes(found.node, found.file, found.function, found.what)
 
 
@@ -53,9 +58,8 @@ def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None,
     """Refuse writes to names and objects from outside of a function; of a class, to global names alone."""
     outside, names = set[str](), dict[str, Any]()
     if function is not None:
-        names = {**function.__globals__, **captured_by(function)}
-        codes = nested_codes(function.__code__)
-        outside = {*function.__code__.co_freevars, *(name for code in codes for name in names_from_outside(code))}
+        names = namespace_of(function)
+        outside = {*function.__code__.co_freevars, *global_names(function.__code__)}
     parts = [*ast.walk(node)]
     stored = {part.id: part for part in parts if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load)}
     for part in parts:
@@ -109,7 +113,7 @@ def _root(node: ast.expr) -> str:
 
 # -- what only a notebook has ----------------------------------------------------------------------------------------
 
-_ASKED: Final = {
+_NAMES_OF_NOTEBOOKS: Final = {
     "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
     "display": "which shows something in the notebook; a service shows nothing. Return it as a token",
     "input": "which asks a person. Make the answer a token",
@@ -127,18 +131,18 @@ _ASKED: Final = {
 )
 
 
-def check_asked(name: str, found: Definition) -> None:
+def check_notebook_name(name: str, found: Definition) -> None:
     """Refuse a name that means something in a notebook alone."""
-    if name in _ASKED and not is_of_notebook(found.names.get(name)):
-        raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")
+    if name in _NAMES_OF_NOTEBOOKS and not is_of_notebook(found.names.get(name)):
+        raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_NAMES_OF_NOTEBOOKS[name]}.")
 
 
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
 
-def check_patches(found: Definition) -> None:
+def check_patches(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
-    known, names = _patches(), {**sys.modules, **found.names, **_imported_by(found)}
+    names = {**sys.modules, **found.names, **_imported_by(found)}
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
@@ -156,10 +160,10 @@ def check_patches(found: Definition) -> None:
             raise _patched(found.what, name if owner is builtins else f"{owner.__name__}.{name}", place)
 
 
-def check_home(module: str, qualname: str, what: str) -> None:
+def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
     """Refuse an object that can be imported only as the notebook has changed it."""
     name = qualname.partition(".")[0]
-    place = _place_of_patch(_patches(), sys.modules[module], name, "by a name that no text has")
+    place = _place_of_patch(known, sys.modules[module], name, "by a name that no text has")
     if place:
         raise _patched(what, f"{module}.{qualname}", place)
 
@@ -182,7 +186,7 @@ def _imported_by(found: Definition) -> dict[str, Any]:
     return names
 
 
-def _place_of_patch(known: Mapping[tuple[Any, str], str], owner: Any, name: str, otherwise: str) -> str:
+def _place_of_patch(known: Patches, owner: Any, name: str, otherwise: str) -> str:
     """Return where the notebook has changed what a module or class has; "" if it has not, ``otherwise`` if unknown."""
     return known.get((owner, name), "") or (otherwise if _is_patched(owner, name) else "")
 
@@ -195,7 +199,7 @@ def _is_patched(owner: Any, name: str) -> bool:
     return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
 
 
-def _patches() -> dict[tuple[Any, str], str]:
+def patches_in_notebook() -> Patches:
     """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
     names, found = vars(sys.modules["__main__"]), dict[tuple[Any, str], str]()
     script = str(names.get("__file__") or "")

@@ -36,7 +36,7 @@ def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: 
 
 def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], samples: Sequence[str] = ()) -> None:
     """Promote with a progress display."""
-    from epypes.bundle.notebook import promote_notebook
+    from epypes.bundle.promote import promote_notebook
 
     with progress() as shown:
         task = shown.add_task("executing the notebook", total=None)
