@@ -71,6 +71,10 @@ class NumberAxis:
             return 0
         return math.floor((_written(self.high) - _written(self.low)) / _written(self.step) + _SLACK) + 1
 
+    def __str__(self) -> str:
+        options = {"step": self.step, "log": self.log or None, "below": self.below or None}
+        return f"{self.low} to {self.high}" + "".join(f" {name} {given}" for name, given in options.items() if given)
+
     def values(self) -> Sequence[Any]:
         """Return all values; if they are too many to hold, only a range of that length.
 
@@ -140,6 +144,9 @@ class ChoiceAxis:
     token: str
     choices: tuple[Any, ...]
     labels: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return " or ".join(self.labels)
 
     def at(self, share: float) -> Any:
         """Return the value at a share from 0 to below 1."""

@@ -22,7 +22,6 @@ from epypes.batch.cache import graph_fingerprint
 from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
-from epypes.bundle.fingerprint import combined_digest
 from epypes.bundle.load import SAMPLES, Bundle, read_bundle
 from epypes.bundle.settings import Unwritable, members_in, read, written
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
@@ -51,7 +50,7 @@ class PackagedGraph:
     Attributes
     ----------
     digest
-        Of its files; a worker process knows by it what it has unpacked.
+        The bundle's; a worker process knows by it what it has unpacked.
     files
         Their contents by path, without samples; None where they are left out.
     """
@@ -90,8 +89,7 @@ def package_of(runner: CompGraphRunner) -> PackagedGraph:
             raise
         paths = sorted(file for file in bundle.path.rglob("*") if file.is_file() and SAMPLES not in file.parts)
         files = {str(file.relative_to(bundle.path)): file.read_bytes() for file in paths}
-    digest = combined_digest(*(part for file in files.items() for part in file)).hex()
-    package = PackagedGraph(digest, files)
+    package = PackagedGraph(bundle.digest, files)
     if (key := _key_of(runner)) is not None:
         _PACKAGES[key] = package
         _drop_oldest(_PACKAGES, _MOST_PACKAGES)

@@ -235,7 +235,7 @@ class Vision(Component):
     """The component that runs the ORB graph on pairs, and answers with the first 20 rows of matched keypoints."""
 
     def __init__(self, q_in: Any, q_out: Any, settings: Settings) -> None:
-        def answer(view: EventView) -> JustBytes:
+        def answer(view: EventView) -> Any:
             contents = encode_keypoints(view["keypoints_paired"][:_ROWS], unsafe_pickle=settings.unsafe_pickle)
             return with_attributes(JustBytes(contents=contents, id=view.event.id), view.event.attributes)
 
