@@ -29,7 +29,6 @@ from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
-from epypes.display.durations import duration_text
 from epypes.display.markup import content, cut, cut_name, escape
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
@@ -206,11 +205,15 @@ class OptimizeResult:
             evaluator = PedAnovaImportanceEvaluator()
             return _figure(lambda: plot_param_importances(self.study, evaluator, target_name=self.metric))
 
-    def __repr__(self) -> str:
-        best = best_of(self.trials, self.direction)
+    @property
+    def _caption(self) -> str:
+        best, failed = best_of(self.trials, self.direction), len(self.failures)
         found = "none completed" if best is None else f"best {self.metric:.30} {best.value:.6g}"
-        stopped = ", stopped" * self.was_stopped
-        return f"<OptimizeResult: {counted(len(self.trials), 'trial')}{stopped}; {found}>"
+        state = f"{f', {failed} failed' if failed else ''}{', stopped' * self.was_stopped}"
+        return f"{counted(len(self.trials), 'trial')}{state}; {found}"
+
+    def __repr__(self) -> str:
+        return f"<OptimizeResult: {self._caption}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         return {"text/plain": repr(self), "text/html": _page(self)}
@@ -646,7 +649,7 @@ _MOST_REASONS: Final = 3
 
 def _page(result: OptimizeResult) -> str:
     best = best_of(result.trials, result.direction)
-    parts = [f"<p>{content(_sentence(result))}</p>"]
+    parts = [f"<p>{content(result._caption)}</p>"]
     if best is not None:
         parts += [_curve(result), _table(result, best)]
     reasons = list(dict.fromkeys(trial.failure for trial in result.failures))
@@ -684,18 +687,6 @@ def _table(result: OptimizeResult, best: Trial) -> str:
     values = (result.metric, f"{best.value:.6g}", "failed" if first.value is None else f"{first.value:.6g}", "")
     head = ("hyperparameter", f"best (trial {best.number})", "first trial", "importance")
     return html_table("", head, [values, *rows])
-
-
-def _sentence(result: OptimizeResult) -> str:
-    best = best_of(result.trials, result.direction)
-    spent_ns = sum(trial.total_ns for trial in result.trials)
-    failed = f", {len(result.failures)} failed" if result.failures else ""
-    stopped = ", stopped before its end" * result.was_stopped
-    trials = f"{counted(len(result.trials), 'trial')}{failed}{stopped}, {duration_text(spent_ns)} of functions."
-    if best is None:
-        return f"{trials} None has completed."
-    what = f"To {result.direction} {cut_name(result.metric, 40)}"
-    return f"{trials} {what}: {best.value:.6g} is the best, of trial {best.number}."
 
 
 @contextlib.contextmanager

@@ -449,7 +449,7 @@ def test_stopped_before_it_began_there_is_no_best(runner: ep.CompGraphRunner) ->
     stop.set()
     result = ep.optimize(runner, "score", [0], stop=stop)
     assert repr(result) == "<OptimizeResult: 0 trials, stopped; none completed>"
-    assert "None has completed" in result._repr_mimebundle_()["text/html"]
+    assert "none completed" in result._repr_mimebundle_()["text/html"]
     for asked in (lambda: result.best, result.history_plot, result.importance_plot):
         with pytest.raises(ScaleError, match="no best one"):
             asked()
