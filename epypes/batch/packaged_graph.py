@@ -13,7 +13,7 @@ import re
 import socket
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
@@ -188,15 +188,17 @@ def unpacked_values(values: Mapping[str, Any], enums: Mapping[str, Any] | None =
 
 def packed_job(job: Job) -> Job:
     """Return a job as it travels: without where it starts, since that has a lock and a runner of this process."""
-    item = replace(job.item, payload=packed_values(job.item.payload, "Input"))
-    settings = tuple(packed_values(setting, "Hyperparameter") for setting in job.settings)
-    return replace(job, item=item, settings=settings, start=None)
+    return replace(_with_values(job, packed_values), start=None)
 
 
 def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:
     """Return the job that ``packed_job`` packed."""
-    item = replace(job.item, payload=unpacked_values(job.item.payload))
-    return replace(job, item=item, settings=tuple(unpacked_values(setting, enums) for setting in job.settings))
+    return _with_values(job, lambda values, _: unpacked_values(values, enums))
+
+
+def _with_values(job: Job, convert: Callable[[Mapping[str, Any], str], dict[str, Any]]) -> Job:
+    item = replace(job.item, payload=convert(job.item.payload, "Input"))
+    return replace(job, item=item, settings=tuple(convert(setting, "Hyperparameter") for setting in job.settings))
 
 
 def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
