@@ -513,9 +513,8 @@ def test_without_a_name_it_follows_from_what_is_searched(tmp_path: Path) -> None
 def test_a_study_of_something_else_is_left_alone(runner: ep.CompGraphRunner, tmp_path: Path) -> None:
     options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "name": "s"}
     ep.optimize(runner, "score", [0], 1, **options)
-    with pytest.raises(
-        ScaleError, match=r"'s' .* something else \(ranges: a in -20.* to 20.*, b in 0 to 4.*\)\. Give another"
-    ):
+    ranges = r"ranges: a in -20 to 20 step 1, b in 0\.0 to 4\.0, other hyperparameters"
+    with pytest.raises(ScaleError, match=rf"'s' .* something else \({ranges}\)\. Give another name="):
         ep.optimize(runner, "score", [0], 2, ranges={"a": (0, 1)}, **options)
     with pytest.raises(ScaleError, match=r"something else \(direction: maximize\)"):
         ep.optimize(runner, "score", [0], 2, direction="minimize", **options)
