@@ -1,8 +1,10 @@
-"""The cache of results: what a stored outcome is keyed by, and which outcomes need not be computed again.
+"""The cache of results: what a stored result is keyed by, and which results need not be computed again.
 
 A series in a store is of one graph and of the hyperparameters that don't vary. Its name is the one that the user gives,
 or the digest of both. An outcome's key is the item's name and content, the values that vary, the tokens that are shown,
 and the state of the lists, arrays and objects that functions use. What can't be digested is never taken from the store.
+The trials of a search are those of a study, whose name is given or digested too; it has no keys. No other module
+decides what a result of a map, a sweep or a search is stored under.
 """
 
 from __future__ import annotations
@@ -214,12 +216,12 @@ class SearchKey:
 
     def difference(self, before: Mapping[str, str]) -> str:
         """Return how a study differs from this search by what it is about; "" if it is the same search."""
-        changed = {what: was for what, now in self.about.items() if (was := before.get(what, "unknown")) and now != was}
-        return ", ".join(
-            f"{what}: {was:.200}" if what in self._readable else f"other {what}"
-            for what, was in changed.items()
-            if self.about[what]
-        )
+        found = []
+        for what, now in self.about.items():
+            was = before.get(what, "unknown")
+            if now and was and now != was:
+                found.append(f"{what}: {was:.200}" if what in self._readable else f"other {what}")
+        return ", ".join(found)
 
     def changed(self) -> list[str]:
         """Return what has another digest by now, as a function that notes its calls in a list."""
