@@ -13,7 +13,7 @@ from epypes.bundle.determinism import prove
 from epypes.bundle.draft import draft_folder, swap_folders
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import check_manifest, digest
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
+from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.bundle.settings import Unwritable, alike, read, written
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
