@@ -233,3 +233,24 @@ def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str
                 yield evaluated(read.value, names), read.attr
             elif isinstance(read, ast.Name):
                 yield builtins, read.id
+
+
+def place_of_change(name: str, *, is_call: bool = False) -> str:
+    """Return the last place in the cells that may have changed an attribute of a library, by its name; "" if none.
+
+    That is an assignment to it or a text or keyword that names it; or a call of it if ``is_call``.
+    """
+    last, found = name.rpartition(".")[2], ""
+    names = vars(sys.modules["__main__"])
+    script = str(names.get("__file__") or "")
+    for cell, text in executed_cells(names, script):
+        tree = parsed(text)
+        for node in ast.walk(tree) if tree else ():
+            words = {getattr(node, "value", None), getattr(node, "arg", None)} if not isinstance(node, ast.arg) else {}
+            is_named = any(isinstance(word, str) and word.rpartition(".")[2] == last for word in words)
+            target = node.func if is_call and isinstance(node, ast.Call) else node
+            is_written = isinstance(target, ast.Attribute) and target.attr == last
+            is_written &= target is not node or not isinstance(getattr(node, "ctx", None), ast.Load)
+            if is_written or (is_named and not is_call):
+                found = f"{f'cell [{cell}]' if cell else script}, line {getattr(node, 'lineno', 0)}"
+    return found
