@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import traceback
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -121,10 +122,13 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
 
 def _imported(folder: Path) -> Any:
     """Execute a bundle's module; what it can't import is named with the way out."""
+    path = folder / MODULE
     try:
-        return execute(folder / MODULE, (folder / MODULE).read_bytes())
+        return execute(path, path.read_bytes())
     except ImportError as error:
-        text = f"{folder / MODULE} can't be imported: {type(error).__name__}: {error}"
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        where = f" at line {frames[-1].lineno}, {frames[-1].line!r}" if frames else ""
+        text = f"{path} can't be imported{where}: {type(error).__name__}: {error}"
         way_out = "Only installed packages can be imported in a bundle: install what its"
         text = f"{text}. {way_out} {REQUIREMENTS} lists, or move the code into the notebook and promote it again."
         raise BundleError(folder, text) from error

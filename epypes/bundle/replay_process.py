@@ -141,7 +141,8 @@ def main(arguments: Sequence[str]) -> int:
             report = _watched(folder, with_libraries="--libraries" in arguments)
         outcome = asdict(report)
     except EpypesError as error:
-        outcome = {"error": str(error)}
+        cause = error.__cause__
+        outcome = {"error": _describe(cause, folder) if isinstance(cause, ImportError) else str(error)}
     except BaseException as error:
         outcome = {"error": _describe(error, folder)}
     out.write_text(json.dumps(outcome), encoding="utf-8")

@@ -177,8 +177,8 @@ def test_a_folder_that_holds_more_than_a_bundle_may_is_refused_before_it_is_read
 
 
 BROKEN_MODULES = {
-    "import no_such_package": r"can't be imported: ModuleNotFoundError.*'no_such_package'.*install what its requirements\.txt lists",
-    "from numpy import no_such_name": r"can't be imported: ImportError.*'no_such_name'.*install what its requirements\.txt",
+    "import no_such_package": r"can't be imported at line \d+, 'import no_such_package': ModuleNotFoundError.*'no_such_package'.*install what its requirements\.txt lists",
+    "from numpy import no_such_name": r"can't be imported at line \d+.*: ImportError.*'no_such_name'.*install what its requirements\.txt",
     "del func_io, func_dict": r"pipeline\.py defines no 'func_dict', 'func_io', which the bundle needs\. Promote the graph again",
 }
 
