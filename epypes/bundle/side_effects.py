@@ -227,7 +227,8 @@ def _patches() -> dict[tuple[Any, str], str]:
             while isinstance(node, ast.Attribute | ast.Subscript):
                 owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
-                if isinstance(node, ast.Attribute) and (is_of_library or isinstance(owner, types.ModuleType)):
+                is_of_library |= isinstance(owner, types.ModuleType)
+                if isinstance(node, ast.Attribute) and node.attr and is_of_library:
                     place = f"cell [{cell}]" if cell else script
                     found[owner, node.attr] = f"{place}, line {written.lineno}"
                     break
