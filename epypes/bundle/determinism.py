@@ -208,7 +208,8 @@ def _changed_settings(usual: ReplayReport, module: Path) -> dict[str, str]:
     for name, default in usual.library_settings.items():
         value = here.get(name, default)
         if value != default and (name != WARNINGS or catches):
-            here_is = ", ".join(filter(None, (place_of_change(name.partition(" ")[0], is_call=True), value)))
+            setting, _, option = name.partition(" ")
+            here_is = ", ".join(filter(None, (place_of_change(option or setting, is_call=not option), value)))
             found[name] = (
                 f"The notebook has changed {name} ({here_is}); a service has it as it is by default "
                 f"({default or 'not set'}). Change it inside the function that needs it, or set it back."

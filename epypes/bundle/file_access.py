@@ -38,7 +38,10 @@ class FileAccess:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._opened: dict[str, str] = {}
+        # What this run has made, what earlier ones have, and what of that was read.
         self._made: set[str] = set()
+        self._made_before: set[str] = set()
+        self._kept: dict[str, str] = {}
         # By path: what names it, and when it was written last.
         self._named: dict[str, tuple[str, int]] = {}
         sys.addaudithook(self._on_event)
@@ -54,7 +57,8 @@ class FileAccess:
                 self._named.setdefault(text, (what, os.stat(text).st_mtime_ns))
 
     def begin_run(self) -> None:
-        """Forget the files that earlier runs have made: what this one reads of them is state."""
+        """Note that what was made up to now is of earlier runs: what this one reads of it is state."""
+        self._made_before |= self._made
         self._made.clear()
 
     @property
@@ -66,11 +70,19 @@ class FileAccess:
             if os.path.exists(text) and os.stat(text).st_mtime_ns == written_ns:
                 found.setdefault(os.path.realpath(text), f"{what} names {text}, which is there.")
         own = self._own_folders()
-        return tuple(
+        outside = [
             f"{reason} {_WAY_OUT}"
             for path, reason in found.items()
             if os.path.exists(path) and not own & {path, *map(str, Path(path).parents)}
-        )
+        ]
+        own.discard(os.path.realpath(os.getcwd()))
+        kept = [
+            f"{what} reads {path}, which an earlier call has written: no answer may depend on an earlier event. "
+            "Make what it keeps a token (ep.delay)."
+            for path, what in self._kept.items()
+            if not own & {path, *map(str, Path(path).parents)}
+        ]
+        return (*outside, *kept)
 
     def _own_folders(self) -> set[str]:
         """Return the folders whose files are there wherever the bundle's requirements are."""
@@ -92,7 +104,7 @@ class FileAccess:
             if flags & os.O_TRUNC or not os.path.exists(path):
                 self._made.add(path)
             elif not flags & os.O_WRONLY and path not in self._made:
-                self._opened.setdefault(path, what)
+                (self._kept if path in self._made_before else self._opened).setdefault(path, what)
 
     def _running_function(self) -> str:
         """Return which function of the bundle is running; "" if none is, or it is importing a module."""

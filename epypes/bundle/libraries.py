@@ -15,11 +15,15 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import importlib
 import sys
 import types
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Final
+
+from epypes.bundle.resolve import evaluated
 
 Attributes = Mapping[str, Mapping[str, str]]
 
@@ -31,9 +35,10 @@ _MOST_TEXT: Final = 60
 _MOST_ENTRIES: Final = 500
 _MOST_BYTES: Final = 65_536
 # They hold the interpreter's own state, which is another one in each kind of process.
-_OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "__main__", "epypes"})
+_OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
 # What these put into other modules, every notebook has.
 _OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
+_OWN: Final = ("__main__.", "unittest.mock.")
 _ALWAYS: Final = frozenset({"builtins", "numpy"})
 
 
@@ -131,8 +136,25 @@ def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes
     """
     own = {name.partition(".")[0] for name in named}
     packages = own | _ALWAYS | ({name.partition(".")[0] for name in new} - sys.stdlib_module_names)
-    packages = {name for name in packages - _OF_THE_PROCESS if not name.startswith("epypes_")}
+    packages = {name for name in packages - _OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
     return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages)
+
+
+def load_named(text: str) -> None:
+    """Load what a bundle's module names of libraries that load their parts when these are first asked for."""
+    nodes, names = [*ast.walk(ast.parse(text))], {**sys.modules}
+    for node in nodes:
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            with suppress(Exception):  # whatever a module raises that no sample has imported
+                if isinstance(node, ast.ImportFrom):
+                    source = importlib.import_module(node.module or "")
+                    names[alias.asname or alias.name] = getattr(source, alias.name)
+                else:
+                    names[alias.asname or alias.name] = importlib.import_module(alias.name)
+    for node in nodes:
+        if isinstance(node, ast.Attribute):
+            with suppress(Exception):
+                evaluated(node, names)
 
 
 def attributes_of(modules: Iterable[str]) -> Attributes:
@@ -161,6 +183,8 @@ def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[t
                 is_changed = other not in ("None", value) and not value.startswith(_OF_NOTEBOOKS)
                 # Not what a loop over a set has left behind in a module.
                 is_changed &= last.isupper() or "." in name or last in mentioned or f".{last}" in other
+                # Nor what libraries do to each other.
+                is_changed &= not last.startswith("_") or value.startswith(_OWN)
             if is_changed:
                 found[module, name] = value, other
     return found
@@ -216,12 +240,15 @@ def _text(value: Any) -> str:
         # Without objects such as sys.stdout.
         given = [*enumerate(value.__defaults__ or ()), *sorted((value.__kwdefaults__ or {}).items())]
         defaults = [one for one in given if callable(one[1]) or isinstance(one[1], (*_ATOMS, tuple, frozenset))]
-        home = f"{value.__globals__.get('__name__')}.{value.__code__.co_qualname}"
+        home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
         return f"{home} {_code_text(value.__code__)} {_text(tuple(defaults))}"
     if inner := _INNER.get(kind) or (("_implementation",) if kind.__name__ == "_ArrayFunctionDispatcher" else ()):
         return f"{' '.join(_text(getattr(value, name)) for name in inner)} {kind.__name__}"
     if kind in (tuple, frozenset):
-        return f"{kind.__name__} {[*map(_text, value)] if kind is tuple else sorted(map(_text, value))}"
+        # Many tuples of names are made of sets.
+        is_ordered = kind is tuple and not all(isinstance(part, str) for part in value)
+        parts = [*map(_text, value)]
+        return f"{kind.__name__} {parts if is_ordered else sorted(parts)}"
     if kind.__module__ == "numpy" and kind.__name__ == "ndarray" and not value.dtype.hasobject:
         content = _digest(value.tobytes()) if value.nbytes <= _MOST_BYTES else ""
         return f"array {value.dtype} {value.shape} {content}"

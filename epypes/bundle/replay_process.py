@@ -25,7 +25,7 @@ from typing import Any, Final
 from epypes.bundle.compare import Difference, differences
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.fingerprint import Digester
-from epypes.bundle.libraries import changed_attributes, library_attributes, library_settings
+from epypes.bundle.libraries import changed_attributes, library_attributes, library_settings, load_named
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.bundle.manifest import (
     MODULE,
@@ -162,10 +162,15 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
     bundle = read_bundle(folder, compare=False)
     access.note_names(bundle.settings.hyperparameters)
     fingerprints, named = _fingerprints(bundle), imported_names(text)
+    trace = sys.gettrace()
+    sys.settrace(None)  # which would make this many times slower
     as_loaded = library_attributes(named, sys.modules.keys() - before) if with_libraries else {}
+    sys.settrace(trace)
     report = replay(bundle, twice=True, on_run=access.begin_run)
     sys.settrace(None)
     new = sys.modules.keys() - before
+    if with_libraries:
+        load_named(text)
     libraries = library_attributes(named, new) if with_libraries else {}
     changed = changed_attributes(libraries, as_loaded, text)
     return replace(
