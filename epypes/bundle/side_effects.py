@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import inspect
 import sys
 import types
 from collections import deque
@@ -125,6 +126,7 @@ _NAMES_OF_NOTEBOOKS: Final = {
     "Out": "what the notebook's cells have shown. Make the value a token",
     "eval": "which may use any name. Write what it evaluates",
     "exec": "which may use any name. Write what it runs",
+    "__import__": "which imports what no statement says. Write an import statement",
 } | dict.fromkeys(
     ("__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"),
     "which is another one in a bundle. Write the value itself, or make it a token",
@@ -137,12 +139,32 @@ def check_notebook_name(name: str, found: Definition) -> None:
         raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_NAMES_OF_NOTEBOOKS[name]}.")
 
 
+# By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
+_REFLECTING: Final = (builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack)
+_REFLECTING_ATTRIBUTES: Final = frozenset(
+    {"__globals__", "__builtins__", "f_globals", "f_locals", "f_builtins", "f_back"}
+)
+
+
+def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that reads the notebook's names otherwise than by name."""
+    for node in ast.walk(found.node):
+        for read in (node, *_attribute_of(node, "getattr")):
+            value = evaluated(read, names) if isinstance(read, ast.Name | ast.Attribute) else None
+            is_main = isinstance(read, ast.Constant) and read.value == "__main__"
+            is_reflecting = any(value is one for one in _REFLECTING)
+            if is_main or is_reflecting or getattr(read, "attr", "") in _REFLECTING_ATTRIBUTES:
+                text = f"{found.what} uses {ast.unparse(read)!r} ({found.place_in(node)}), by which it reaches"
+                raise Refused(f"{text} what no name in it says. Use what you need by its name, or make it a token.")
+
+
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
 
 def check_patches(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
     names = {**sys.modules, **found.names, **_imported_by(found)}
+    _check_reflection(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
@@ -209,7 +231,8 @@ def patches_in_notebook() -> Patches:
             while isinstance(node, ast.Attribute | ast.Subscript):
                 owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
-                if isinstance(node, ast.Attribute) and (is_of_library or isinstance(owner, types.ModuleType)):
+                is_of_library |= isinstance(owner, types.ModuleType)
+                if isinstance(node, ast.Attribute) and node.attr and is_of_library:
                     place = f"cell [{cell}]" if cell else script
                     found[owner, node.attr] = f"{place}, line {written.lineno}"
                     break
@@ -233,3 +256,28 @@ def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str
                 yield evaluated(read.value, names), read.attr
             elif isinstance(read, ast.Name):
                 yield builtins, read.id
+
+
+def place_of_change(name: str, *, is_call: bool = False) -> str:
+    """Return the last place in the cells that may have changed an attribute of a library, by its name; "" if none.
+
+    That is an assignment to it, or a text or keyword that names it; or a call of it if ``is_call``.
+    """
+    last, found = name.rpartition(".")[2], ""
+    script = str(vars(sys.modules["__main__"]).get("__file__") or "")
+    for cell, text in executed_cells(vars(sys.modules["__main__"]), script):
+        tree = parsed(text)
+        nodes: list[Any] = [*ast.walk(tree)] if tree else []
+        read = {id(node.slice) for node in nodes if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)}
+        lines = [node.lineno for node in nodes if id(node) not in read and _may_change(node, last, is_call=is_call)]
+        found = f"{f'cell [{cell}]' if cell else script}, line {lines[-1]}" if lines else found
+    return found
+
+
+def _may_change(node: Any, name: str, *, is_call: bool) -> bool:
+    if is_call:
+        return isinstance(node, ast.Call) and getattr(node.func, "attr", "") == name
+    if isinstance(node, ast.Attribute):
+        return node.attr == name and not isinstance(node.ctx, ast.Load)
+    text = node.arg if isinstance(node, ast.keyword) else getattr(node, "value", None)
+    return isinstance(text, str) and text.rpartition(".")[2] == name

@@ -12,7 +12,7 @@ from typing import Any
 from epypes.bundle.determinism import prove
 from epypes.bundle.manifest import SETTINGS, check_manifest, digest
 from epypes.bundle.promote import draft_folder, swap_folders
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
+from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.bundle.settings import MOST_NUMBERS, Unwritable, cast_like, decode_value, encode_value
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
