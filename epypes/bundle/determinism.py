@@ -3,7 +3,8 @@
 Two processes replay at the same time, each every sample twice. One of them has the usual conditions, in the other all
 of them are others: what the surroundings of a process may change, and nothing that a bundle computes. Where a token
 differs, replays with one other condition each find the one that changes it. Floats that differ by noise alone get a
-tolerance.
+tolerance. Both processes also describe how libraries are set and what they hold: what this process has otherwise, the
+notebook has changed, and it is refused also where no sample shows it.
 """
 
 from __future__ import annotations

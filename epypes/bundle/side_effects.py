@@ -1,6 +1,7 @@
 """Static checks that name the line: writes to state that outlives a call, monkeypatches, and what only a notebook has.
 
-What syntax can't see is found by the replays, and by the snapshot that guards the functions of a loaded bundle.
+What syntax can't see is found by the replays, by the comparison of libraries with those of a fresh process, and by the
+snapshot that guards the functions of a loaded bundle.
 """
 
 from __future__ import annotations
