@@ -111,7 +111,7 @@ PATCHES = {
     ),
     "a new attribute": (
         "def add(module, **values):\n    vars(module).update(values)\nadd(np, gain_of_here=3)",
-        "np.gain_of_here",
+        "getattr(np, 'gain_of_here', 1)",
         "numpy.gain_of_here (cell [N], line 3, 3); a service has it as it was installed (it is not there).",
     ),
 }  # fmt: skip
