@@ -3,7 +3,8 @@
 Two processes replay at the same time, each every sample twice. One of them has the usual conditions, in the other all
 of them are others: what the surroundings of a process may change, and nothing that a bundle computes. Where a token
 differs, replays with one other condition each find the one that changes it. Floats that differ by noise alone get a
-tolerance.
+tolerance. Both processes also describe how libraries are set and what they hold: what this process has otherwise, the
+notebook has changed, and it is refused also where no sample shows it.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ from epypes.wire.samples import load_sample, save_sample
 _PROCESSES: Final = 2
 # OpenCV reads the last one as what cv2.setNumThreads would set.
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-_MOST_NAMED: Final = 8
+_MOST_NAMED: Final = 12
+# What a description ends with whose content is too long.
+_DIGEST: Final = re.compile(r" [0-9a-f]{16}\b.*")
 _VARIABLE: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 
 
@@ -226,12 +229,18 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, module: Path) -
         if (others := other.libraries.get(library, described)) is not None
     }
     changed = changed_attributes(attributes_of(fresh), fresh, module.read_text(encoding="utf-8"))
-    found = [
-        f"The notebook has changed {library}.{name} ({', '.join(filter(None, (place_of_change(name), value)))}); a "
-        f"service has it as it was installed ({default or 'it is not there'}). Undo that; call yours by a name of its "
-        "own, or make the value a token."
-        for (library, name), (value, default) in changed.items()
-    ]
+    # One change is found wherever a library has the object; the shortest of these names is the best known.
+    distinct: dict[tuple[str, str, str], str] = {}
+    for (library, name), both in sorted(changed.items(), key=lambda item: len(item[0][0])):
+        distinct.setdefault((name, *both), library)
+    found = []
+    for (name, value, default), library in distinct.items():
+        here, there = (_DIGEST.sub("", text) for text in (value, default or "it is not there"))
+        here = ", ".join(filter(None, (place_of_change(name), here if here != there else "in its code or defaults")))
+        found.append(
+            f"The notebook has changed {library}.{name} ({here}); a service has it as it was installed ({there}). "
+            "Undo that; call yours by a name of its own, or make the value a token."
+        )
     return found[:_MOST_NAMED]
 
 

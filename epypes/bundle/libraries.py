@@ -61,13 +61,18 @@ def is_of_texts(setting: str) -> bool:
 
 
 def _of_python(sys: Any) -> dict[str, str]:
+    kinds = [kind for action, _, kind, *_ in warnings.filters if action == "error"]
     limit = sys.getrecursionlimit()
     # Jedi, which completes names in notebooks, sets it when it is imported.
     usual = 1_000 if limit == 3_000 and "jedi" in sys.modules else limit
     return {
         "sys.setrecursionlimit": f"{usual}",
         "sys.set_int_max_str_digits": f"{sys.get_int_max_str_digits()}",
-        WARNINGS: ", ".join(f"{kind} is an error" for action, _, kind, *_ in warnings.filters if action == "error"),
+        WARNINGS: ", ".join(
+            f"{kind.__name__} is an error"
+            for kind in kinds
+            if isinstance(kind, type) and not kind.__module__.startswith(_OF_NOTEBOOKS)
+        ),
     }
 
 

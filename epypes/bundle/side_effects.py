@@ -1,6 +1,7 @@
 """Static checks that name the line: writes to state that outlives a call, monkeypatches, and what only a notebook has.
 
-What syntax can't see is found by the replays, and by the snapshot that guards the functions of a loaded bundle.
+What syntax can't see is found by the replays, by the comparison of libraries with those of a fresh process, and by the
+snapshot that guards the functions of a loaded bundle.
 """
 
 from __future__ import annotations
@@ -269,6 +270,8 @@ def place_of_change(name: str, *, is_call: bool = False) -> str:
         tree = parsed(text)
         nodes: list[Any] = [*ast.walk(tree)] if tree else []
         read = {id(node.slice) for node in nodes if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)}
+        calls = (node for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "getattr")
+        read |= {id(argument) for call in calls for argument in call.args}
         lines = [node.lineno for node in nodes if id(node) not in read and _may_change(node, last, is_call=is_call)]
         found = f"{f'cell [{cell}]' if cell else script}, line {lines[-1]}" if lines else found
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import decimal
 import locale
 import sys
@@ -37,8 +38,8 @@ def refusal(monkeypatch, to, *cells):
     return "\n".join(caught.value.reasons)
 
 
-@pytest.fixture
-def as_before():
+@contextlib.contextmanager
+def put_back():
     """Put the attributes of libraries back that a test changes."""
     import colorsys
     import fractions
@@ -47,16 +48,17 @@ def as_before():
     from skimage.filters import gaussian, thresholding
 
     attributes = [
-        (cv2, "INTER_AREA"), (np, "median"), (thresholding, "histogram"), (fractions.Fraction, "limit_denominator"),
+        (cv2, "INTER_AREA"), (cv2, "INTER_CUBIC"), (cv2, "INTER_LINEAR"), (np, "median"), (thresholding, "histogram"), (fractions.Fraction, "limit_denominator"),
         (textwrap.indent, "__defaults__"), (colorsys, "ONE_THIRD"), (gaussian, "__code__"), (gaussian, "__kwdefaults__"),
     ]  # fmt: skip
     values = [(owner, name, getattr(owner, name)) for owner, name in attributes]
-    yield
-    for owner, name, value in values:
-        setattr(owner, name, value)
-    for name in ("gain_of_here", "n_calls"):
-        if hasattr(np, name):
-            delattr(np, name)
+    try:
+        yield
+    finally:
+        for owner, name, value in values:
+            setattr(owner, name, value)
+        for name in ("gain_of_here", "n_calls"):
+            vars(np).pop(name, None)
 
 
 # By what patches it: a cell, what is computed on a branch, and what the reason says.
@@ -64,42 +66,42 @@ PATCHES = {
     "a helper": (
         "def patch(module, name, value):\n    setattr(module, name, value)\npatch(cv2, 'INTER_AREA', 0)",
         "cv2.INTER_AREA",
-        "The notebook has changed cv2.INTER_AREA (cell [1], line 3, 0); a service has it as it was installed (3).",
+        "The notebook has changed cv2.INTER_AREA (cell [N], line 3, 0); a service has it as it was installed (3).",
     ),
     "the namespace": (
-        "cv2.__dict__.update(INTER_AREA=0)",
-        "cv2.resize(x, (9, 9), interpolation=cv2.INTER_AREA)",
-        "cv2.INTER_AREA (cell [1], line 1, 0)",
+        "cv2.__dict__.update(INTER_CUBIC=0)",
+        "cv2.resize(x, (9, 9), interpolation=cv2.INTER_CUBIC)",
+        "cv2.INTER_CUBIC (cell [N], line 1, 0)",
     ),
     "the namespace in a loop": (
-        "for name, value in {'INTER_AREA': 0}.items():\n    vars(cv2)[name] = value",
-        "cv2.INTER_AREA",
-        "cv2.INTER_AREA (cell [1], line 1, 0)",
+        "for name, value in {'INTER_LINEAR': 0}.items():\n    vars(cv2)[name] = value",
+        "cv2.INTER_LINEAR",
+        "cv2.INTER_LINEAR (cell [N], line 1, 0)",
     ),
     "another name of the module": (
         "def patch(module):\n    module.median = np.max\npatch(np)",
         "float(np.median(x))",
-        "numpy.median (cell [1], line 2, ",
+        "numpy.median (cell [N], line 2, ",
     ),
     "a mock of a constant": (
         "from unittest import mock\n_ = mock.patch('colorsys.ONE_THIRD', 9.0).start()",
         "colorsys.ONE_THIRD",
-        "colorsys.ONE_THIRD (cell [1], line 2, 9.0)",
+        "colorsys.ONE_THIRD (cell [N], line 2, 9.0)",
     ),
     "a change deep in a library": (
         "import skimage.filters.thresholding as th\nth.histogram = lambda *a, **k: (np.array([1, 5]), np.array([10, 20]))",
         "float(skimage.filters.threshold_isodata(x))",
-        "skimage.filters.thresholding.histogram (cell [1], line 2, ",
+        "skimage.filters.thresholding.histogram (cell [N], line 2, ",
     ),
     "a method of a class": (
         "import fractions\ntype.__setattr__(fractions.Fraction, 'limit_denominator', lambda self, n=9: 5)",
         "float(fractions.Fraction(1, 3).limit_denominator())",
-        "fractions.Fraction.limit_denominator (cell [1], line 2, ",
+        "fractions.Fraction.limit_denominator (cell [N], line 2, ",
     ),
     "defaults": (
         "import textwrap\ndef change(f, *values):\n    f.__defaults__ = values\nchange(textwrap.indent, bool)",
         "textwrap.indent('a', '> ')",
-        "The notebook has changed textwrap.indent (",
+        "The notebook has changed textwrap.indent (in its code or defaults); ",
     ),
     "code": (
         "from skimage.filters import gaussian\ndef change(f, g):\n    f.__code__, f.__kwdefaults__ = g.__code__, None\n"
@@ -109,27 +111,35 @@ PATCHES = {
     ),
     "a new attribute": (
         "def add(module, **values):\n    vars(module).update(values)\nadd(np, gain_of_here=3)",
-        "np.gain_of_here",
-        "numpy.gain_of_here (cell [1], line 3, 3); a service has it as it was installed (it is not there).",
+        "getattr(np, 'gain_of_here', 1)",
+        "numpy.gain_of_here (cell [N], line 3, 3); a service has it as it was installed (it is not there).",
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("how", PATCHES)
-@pytest.mark.usefixtures("as_before")
-def test_a_library_that_the_notebook_has_patched_is_named_with_its_line(how, monkeypatch, tmp_path):
-    patch, used, reason = PATCHES[how]
+@pytest.fixture(scope="module")
+def reasons_against_patches(tmp_path_factory):
+    """All patches in one notebook, since each promotion starts processes."""
     imports = "import colorsys, fractions, textwrap, skimage.filters\nfrom skimage.filters import gaussian"
-    assert reason in refusal(monkeypatch, tmp_path, patch, branch(used, imports))
+    used = ", ".join(used for _, used, _ in PATCHES.values())
+    with pytest.MonkeyPatch.context() as monkeypatch, put_back():
+        cells = [imports, *(cell for cell, _, _ in PATCHES.values()), branch(f"({used})")]
+        return refusal(monkeypatch, tmp_path_factory.mktemp("patches"), *cells)
 
 
-@pytest.mark.usefixtures("as_before")
+@pytest.mark.parametrize("how", PATCHES)
+def test_a_library_that_the_notebook_has_patched_is_named_with_its_line(how, reasons_against_patches):
+    number = [*PATCHES].index(how) + 2
+    assert PATCHES[how][2].replace("cell [N]", f"cell [{number}]") in reasons_against_patches
+
+
 def test_a_function_that_keeps_something_in_a_library_is_refused(monkeypatch, tmp_path):
     source = (
         "def bump(owner):\n    owner.n_calls = getattr(owner, 'n_calls', 0) + 1\n    return owner.n_calls\n"
         "def use(x):\n    return bump(np) * 0"
     )
-    text = refusal(monkeypatch, tmp_path, source)
+    with put_back():
+        text = refusal(monkeypatch, tmp_path, source)
     assert "A function changes numpy.n_calls while it runs, which outlives the call" in text
 
 
@@ -151,29 +161,37 @@ SETTINGS = {
 }
 
 
-@pytest.fixture
-def settings_as_before():
+@contextlib.contextmanager
+def settings_put_back():
     limit, digits, used = sys.getrecursionlimit(), sys.get_int_max_str_digits(), locale.setlocale(locale.LC_ALL)
     with warnings.catch_warnings(), mpl.rc_context(), decimal.localcontext():
         warnings.resetwarnings()
-        yield
-    sys.setrecursionlimit(limit)
-    sys.set_int_max_str_digits(digits)
-    locale.setlocale(locale.LC_ALL, used)
-    pd.reset_option("compute.use_bottleneck")
+        try:
+            yield
+        finally:
+            sys.setrecursionlimit(limit)
+            sys.set_int_max_str_digits(digits)
+            locale.setlocale(locale.LC_ALL, used)
+            pd.reset_option("compute.use_bottleneck")
 
 
-@pytest.mark.parametrize("name", SETTINGS)
-@pytest.mark.usefixtures("settings_as_before")
-def test_a_setting_that_the_notebook_has_changed_is_named_with_its_line(name, monkeypatch, tmp_path):
-    change, used = SETTINGS[name]
+@pytest.fixture(scope="module")
+def reasons_against_settings(tmp_path_factory):
     before = (
         "import decimal, locale, matplotlib\nimport pandas as pd\n"
         "def caught(x):\n    try:\n        return float(np.float64(1) / x.min())\n    except RuntimeWarning:\n        return -1.0"
     )
-    text = refusal(monkeypatch, tmp_path, change, branch(used, before))
-    assert f"The notebook has changed {name} (cell [1], line 2, " in text
-    assert "Change it inside the function that needs it, or set it back." in text
+    used = ", ".join(used for _, used in SETTINGS.values())
+    with pytest.MonkeyPatch.context() as monkeypatch, settings_put_back():
+        cells = [*(cell for cell, _ in SETTINGS.values()), branch(f"({used})", before)]
+        return refusal(monkeypatch, tmp_path_factory.mktemp("settings"), *cells)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_setting_that_the_notebook_has_changed_is_named_with_its_line(name, reasons_against_settings):
+    number = [*SETTINGS].index(name) + 1
+    assert f"The notebook has changed {name} (cell [{number}], line 2, " in reasons_against_settings
+    assert "Change it inside the function that needs it, or set it back." in reasons_against_settings
 
 
 def test_options_that_change_how_tables_are_shown_are_noted(monkeypatch, tmp_path):
