@@ -60,20 +60,10 @@ def is_of_texts(setting: str) -> bool:
     return setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
 
 
-def _of_python(sys: Any) -> dict[str, str]:
+def _of_warnings(warnings: Any) -> dict[str, str]:
     kinds = [kind for action, _, kind, *_ in warnings.filters if action == "error"]
-    limit = sys.getrecursionlimit()
-    # Jedi, which completes names in notebooks, sets it when it is imported.
-    usual = 1_000 if limit == 3_000 and "jedi" in sys.modules else limit
-    return {
-        "sys.setrecursionlimit": f"{usual}",
-        "sys.set_int_max_str_digits": f"{sys.get_int_max_str_digits()}",
-        WARNINGS: ", ".join(
-            f"{kind.__name__} is an error"
-            for kind in kinds
-            if isinstance(kind, type) and not kind.__module__.startswith(_OF_NOTEBOOKS)
-        ),
-    }
+    own = (kind for kind in kinds if isinstance(kind, type) and not kind.__module__.startswith(_OF_NOTEBOOKS))
+    return {WARNINGS: ", ".join(f"{kind.__name__} is an error" for kind in own)}
 
 
 def _of_numpy(numpy: Any) -> dict[str, str]:
@@ -90,6 +80,13 @@ def _of_decimal(decimal: Any) -> dict[str, str]:
     traps = sorted(signal.__name__ for signal, is_on in context.traps.items() if is_on)
     text = ", ".join(f"{part}={getattr(context, part)}" for part in parts)
     return {"decimal.getcontext": f"{text}, traps={' '.join(traps)}"}
+
+
+def _of_locale(locale: Any) -> dict[str, str]:
+    # All numbers, dates and orders of C.UTF-8 are those of C.
+    parts = {part: locale.setlocale(getattr(locale, part)) for part in ("LC_NUMERIC", "LC_TIME", "LC_COLLATE")}
+    others = (f"{part}={name}" for part, name in parts.items() if name.partition(".")[0] not in ("C", "POSIX"))
+    return {"locale.setlocale": ", ".join(others)}
 
 
 def _of_pandas(pandas: Any) -> dict[str, str]:
@@ -116,10 +113,10 @@ def _of_matplotlib(matplotlib: Any) -> dict[str, str]:
 
 
 _SETTINGS: Final[tuple[tuple[str, Callable[[Any], dict[str, str]]], ...]] = (
-    ("sys", _of_python),
+    ("warnings", _of_warnings),
     ("numpy", _of_numpy),
     ("decimal", _of_decimal),
-    ("locale", lambda locale: {"locale.setlocale": locale.setlocale(locale.LC_ALL)}),
+    ("locale", _of_locale),
     ("cv2", lambda cv2: {"cv2.setUseOptimized": f"{cv2.useOptimized()}"}),
     ("pandas", _of_pandas),
     ("matplotlib", _of_matplotlib),

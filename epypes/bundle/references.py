@@ -77,6 +77,12 @@ def namespace_of(function: types.FunctionType) -> dict[str, Any]:
     return {**function.__globals__, **captured_by(function)}
 
 
+def is_of_ipython(name: str, value: object) -> bool:
+    """Whether a global stands for a builtin of its name: in notebooks, IPython has put its own ``open`` there."""
+    home = getattr(value, "__globals__", {}).get("__name__", "")
+    return hasattr(builtins, name) and home.startswith("IPython.")
+
+
 def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str, Any]:
     """Return what names mean to a function; those that mean nothing are left out."""
     captured, free = captured_by(function), function.__code__.co_freevars
@@ -84,7 +90,7 @@ def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str,
     for name in names:
         if name in free:
             found |= {name: captured[name]} if name in captured else {}
-        elif name in function.__globals__:
+        elif name in function.__globals__ and not is_of_ipython(name, function.__globals__[name]):
             found[name] = function.__globals__[name]
         elif hasattr(builtins, name):
             found[name] = getattr(builtins, name)

@@ -35,6 +35,7 @@ from epypes.bundle.expressions import (
     names_in,
     quoted,
 )
+from epypes.bundle.references import is_of_ipython
 from epypes.bundle.resolve import (
     LATE_ANNOTATIONS,
     Definition,
@@ -356,7 +357,7 @@ class Slice:
     def _add_name(self, name: str, found: Definition, what: str) -> None:
         """Add what one global name of a definition means at the time of promotion."""
         check_notebook_name(name, found)
-        if name not in found.names:
+        if name not in found.names or is_of_ipython(name, found.names[name]):
             self._add_builtin(name, found)
             return
         self.read[name] = value = found.names[name]

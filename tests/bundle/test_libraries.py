@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import decimal
-import locale
-import sys
 import warnings
 
 import cv2
@@ -145,9 +143,6 @@ def test_a_function_that_keeps_something_in_a_library_is_refused(monkeypatch, tm
 
 # By name: a cell that changes a setting, and what is computed on a branch.
 SETTINGS = {
-    "sys.setrecursionlimit": ("import sys\nsys.setrecursionlimit(1717)", "0"),
-    "sys.set_int_max_str_digits": ("import sys\nsys.set_int_max_str_digits(0)", "len(str(10 ** 5000))"),
-    "locale.setlocale": ("import locale\n_ = locale.setlocale(locale.LC_ALL, 'C.UTF-8')", "locale.str(1.5)"),
     "decimal.getcontext": ("import decimal\ndecimal.getcontext().Emax = 99", "str(decimal.Decimal(1) / 3)"),
     "pandas.set_option compute.use_bottleneck": (
         "import pandas as pd\npd.set_option('compute.use_bottleneck', False)",
@@ -163,22 +158,18 @@ SETTINGS = {
 
 @contextlib.contextmanager
 def settings_put_back():
-    limit, digits, used = sys.getrecursionlimit(), sys.get_int_max_str_digits(), locale.setlocale(locale.LC_ALL)
     with warnings.catch_warnings(), mpl.rc_context(), decimal.localcontext():
         warnings.resetwarnings()
         try:
             yield
         finally:
-            sys.setrecursionlimit(limit)
-            sys.set_int_max_str_digits(digits)
-            locale.setlocale(locale.LC_ALL, used)
             pd.reset_option("compute.use_bottleneck")
 
 
 @pytest.fixture(scope="module")
 def reasons_against_settings(tmp_path_factory):
     before = (
-        "import decimal, locale, matplotlib\nimport pandas as pd\n"
+        "import decimal, matplotlib\nimport pandas as pd\n"
         "def caught(x):\n    try:\n        return float(np.float64(1) / x.min())\n    except RuntimeWarning:\n        return -1.0"
     )
     used = ", ".join(used for _, used in SETTINGS.values())
@@ -192,6 +183,14 @@ def test_a_setting_that_the_notebook_has_changed_is_named_with_its_line(name, re
     number = [*SETTINGS].index(name) + 1
     assert f"The notebook has changed {name} (cell [{number}], line 2, " in reasons_against_settings
     assert "Change it inside the function that needs it, or set it back." in reasons_against_settings
+
+
+def test_a_locale_that_the_notebook_has_set_is_named(monkeypatch, tmp_path):
+    # The machine may have no other one than C.
+    monkeypatch.setattr("locale.setlocale", lambda category, name=None: "de_DE.UTF-8")
+    refused = refusal(monkeypatch, tmp_path, branch("locale.str(1.5)", "import locale"))
+    assert "The notebook has changed locale.setlocale" in refused
+    assert "LC_NUMERIC=de_DE.UTF-8" in refused
 
 
 def test_options_that_change_how_tables_are_shown_are_noted(monkeypatch, tmp_path):

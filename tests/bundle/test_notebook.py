@@ -37,6 +37,19 @@ def test_the_caller_gets_the_progress_of_cells_and_of_the_promotion(tmp_path):
 
 
 @pytest.mark.notebook
+def test_a_function_may_open_a_file_of_its_own(tmp_path):
+    """IPython has put an ``open`` of its own among the names of the notebook."""
+    function = (
+        "import tempfile, epypes as ep\n"
+        "def double(x):\n    with tempfile.TemporaryDirectory() as folder:\n"
+        "        with open(f'{folder}/x', 'w') as file:\n            file.write('')\n    return 2 * x\n"
+        "runner = ep.CompGraphRunner(ep.CompGraph.from_functions(double))\nrun = runner.run(x=1)"
+    )
+    promote_notebook(written(tmp_path / "n.ipynb", function), "runner", tmp_path / "b")
+    assert verify(tmp_path / "b").identical
+
+
+@pytest.mark.notebook
 def test_the_reasons_against_a_promotion_come_back_one_by_one(tmp_path):
     more = "seen = []\ndef note(double):\n    seen.append(double)\n    return double"
     graph = "runner = ep.CompGraphRunner(ep.extend(runner.cg, {'note': note}, {'note': ('double', 'noted')}))"
