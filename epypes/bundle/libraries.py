@@ -24,6 +24,7 @@ from contextlib import suppress
 from typing import Any, Final
 
 from epypes.bundle.resolve import evaluated
+from epypes.run.snapshot import is_own
 
 Attributes = Mapping[str, Mapping[str, str]]
 
@@ -139,7 +140,8 @@ def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes
     own = {name.partition(".")[0] for name in named}
     packages = own | _ALWAYS | ({name.partition(".")[0] for name in new} - sys.stdlib_module_names)
     packages = {name for name in packages - _OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
-    return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages)
+    # The user's own modules are looked at by what the functions refer to.
+    return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages and not is_own(name))
 
 
 def load_named(text: str) -> None:
