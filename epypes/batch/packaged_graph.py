@@ -27,8 +27,8 @@ from epypes.bundle.load import SAMPLES, Bundle, read_bundle
 from epypes.bundle.settings import Unwritable, members_in, read, written
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
-from epypes.run.branch import branched
 from epypes.run.guard import is_plain_array
+from epypes.run.runner import branched
 from epypes.wire import Envelope, decode, encode
 from epypes.wording import ended
 

@@ -200,7 +200,7 @@ class Component(FullPipeline):
 
     def put(self, answer: Any, view: EventView) -> None:
         """Add the end of f_out and the time of publishing to an answer, then put it on q_out."""
-        t_pub = view.stamps.now_ns() / _NS
+        t_pub = view.now_ns() / _NS
         self._add(answer, "t_fout_end", view.stamps.f_out_end_ns / _NS)
         self._add(answer, "t_pub", t_pub)
         super().put(answer, view)

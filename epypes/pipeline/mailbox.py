@@ -10,8 +10,7 @@ from time import monotonic
 from typing import Any, Final, Literal, get_args
 
 from epypes.errors import MailboxOverflow
-from epypes.pipeline.log import log_error
-from epypes.pipeline.settling import reject
+from epypes.pipeline.event_loop import log_error, reject
 
 Policy = Literal["latest", "drop_oldest", "block", "fault"]
 _POLICIES: Final = get_args(Policy)

@@ -1,31 +1,16 @@
-"""A function at run time."""
+"""A function at run time, and the network of them that a graph becomes."""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from time import perf_counter_ns
-from types import CodeType
-from typing import Any, Final, TypeVar
+from types import MappingProxyType
+from typing import Any
 
+from epypes.graph import CompGraph, with_functions
 from epypes.run.guard import WATCH, called_for
-from epypes.run.underway import functions_under_way, locals_under_way
-
-M = TypeVar("M", bound=Callable[..., Any])
-
-_CALLS: Final[set[CodeType]] = set()
-
-
-def is_a_call(method: M) -> M:
-    """Mark a method of nodes: as long as it has not returned, its node is running."""
-    _CALLS.add(method.__code__)
-    return method
-
-
-def under_way() -> list[object]:
-    """Return the nodes that have been called and have not returned, in any thread, and the functions of graphs."""
-    return [*functions_under_way(), *(found["self"] for found in locals_under_way(_CALLS))]
 
 
 class Node:
@@ -66,7 +51,7 @@ class Node:
         self.duration_ns = 0
         self.run_count = 0
         # Whole in every thread, which counting up is not.
-        self.next_count = itertools.count(1).__next__
+        self._next_count = itertools.count(1).__next__
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func, updated=())
         # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
@@ -75,16 +60,18 @@ class Node:
         }
         self.__dict__.update(marks)
 
-    @is_a_call
     def __call__(self, *args: Any) -> Any:
         """Compute, and measure the time."""
         start_ns = perf_counter_ns()
         try:
             return self.compute(*args)
         finally:
-            # What calls ``func`` in its place does these two as well.
-            self.duration_ns = perf_counter_ns() - start_ns
-            self.run_count = self.next_count()
+            self.count_call(perf_counter_ns() - start_ns)
+
+    def count_call(self, duration_ns: int) -> None:
+        """Take note of a call; a run, which calls ``func`` in the node's place, does so when it has ended."""
+        self.duration_ns = duration_ns
+        self.run_count = self._next_count()
 
     @property
     def time(self) -> float:
@@ -97,14 +84,9 @@ class Node:
 
     @property
     def __epypes_is_its_func__(self) -> bool:
-        """Whether it comes to the same to call ``func``, set ``duration_ns`` and count the call."""
+        """Whether it comes to the same to call ``func``, and ``count_call`` later."""
         kind = type(self)
         return kind.__call__ is Node.__call__ and kind.compute is Node.compute and "compute" not in vars(self)
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a call has not returned yet."""
-        return any(node is self for node in under_way())
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call)``; a pipeline adds its nodes' tuples as a third item."""
@@ -112,3 +94,35 @@ class Node:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__:.30} {self.name!r:.40}: {self.run_count} calls>"
+
+
+class NodeBasedCompGraph:
+    """The network of Nodes of a graph; functions that are Nodes already (a Pipeline, a subclass) are kept.
+
+    Attributes
+    ----------
+    nodes
+        The nodes by function name, in run order.
+    cg
+        The same graph with the nodes in place of the functions.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Nodes and pipelines".
+    """
+
+    def __init__(self, cg: CompGraph) -> None:
+        self.nodes: Mapping[str, Node] = MappingProxyType(
+            {
+                name: function if isinstance(function, Node) else Node(name, function)
+                for name, function in cg.functions.items()
+            }
+        )
+        self.cg = with_functions(cg, self.nodes)
+
+    def traverse_time(self) -> tuple[Any, ...]:
+        """Return the nodes' ``traverse_time()``, in run order."""
+        return tuple(node.traverse_time() for node in self.nodes.values())
+
+    def __repr__(self) -> str:
+        return f"<NodeBasedCompGraph: {len(self.nodes)} nodes>"

@@ -5,18 +5,51 @@ from __future__ import annotations
 import inspect
 import keyword
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Literal
 
 from epypes.errors import HyperparameterError, PayloadError
 from epypes.graph import CompGraph
 from epypes.graph.hinted import annotated_params
 from epypes.hints import Param, Roi
-from epypes.pipeline.network import NodeBasedCompGraph
-from epypes.pipeline.node import Node, is_a_call
-from epypes.pipeline.stages import Stages
+from epypes.pipeline.node import Node, NodeBasedCompGraph
 from epypes.run import CompGraphRunner, Run
 from epypes.wording import counted
+
+StageKind = Literal["queue", "loop", "function"]
+StageState = Literal["static", "running", "stopped", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage of a reactive pipeline, outside its graph, at one moment.
+
+    Attributes
+    ----------
+    kind
+        What it is: a queue, an event loop, or a function such as f_in.
+    name
+        Such as ``"q_in"``.
+    state
+        ``"running"``: of a loop that it listens, of a function that an event is in it, of a queue that somebody waits
+        to put something on it; ``"failed"``: of a function that the last event failed in it.
+    notes
+        Short lines: what it is, its counts.
+    """
+
+    kind: StageKind
+    name: str
+    state: StageState = "static"
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """The stages that an event passes before and after the graph, in that order."""
+
+    before: tuple[Stage, ...] = ()
+    after: tuple[Stage, ...] = ()
 
 
 class Pipeline(Node):
@@ -85,20 +118,15 @@ class Pipeline(Node):
         """What an event passes before and after the graph, as it is at this moment; the hook for subclasses."""
         return Stages()
 
-    @is_a_call
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
-        # To free the tokens of the run before takes its time, which is not this run's.
-        before = self.runner.last
         start_ns = perf_counter_ns()
         try:
             run: Run = self.compute(payload)
             return run
         finally:
             self.duration_ns = perf_counter_ns() - start_ns
-            self.run_count = self.next_count()
-            # Not at the end of this frame, which a failure keeps.
-            del before
+            self.run_count = self._next_count()
 
     def __call__(self, *args: Any) -> Any:
         """Run the graph on the free source tokens, in order; return its sink token or tokens."""

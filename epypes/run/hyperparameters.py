@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.errors import HyperparameterError
+from epypes.errors import HyperparameterError, PayloadError, UnknownName
 from epypes.run.guard import ARRAYLESS, keep, require_reusable
 from epypes.run.program import Program
-from epypes.run.refused import wrong_payload
-from epypes.run.tokens import NOT_COMPUTED, is_same_value
+from epypes.run.staleness import NOT_COMPUTED, is_same_value
 
 if TYPE_CHECKING:
-    from epypes.run.attempt import Attempts
+    from epypes.run.execute import CompiledRun
 
 _NOTHING: Final[Mapping[str, Any]] = {}
 
@@ -34,12 +33,12 @@ class Hyperparameters:
         That revision; -1 if other tokens were hyperparameters in it.
     plain
         The tokens whose values are numbers, texts or None: they hold no arrays, so functions get them as they are.
-    start
-        ``base``, ``free_slots`` and the attempts that the runner makes with these plain tokens, once it has made one.
+    repeated
+        The compiled run of every step with these plain tokens, ``base`` and ``free_slots``, once there is one.
     """
 
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    __slots__ = ("_base", "_free_slots", "changed", "entries", "follows", "plain", "program", "revision", "start")
+    __slots__ = ("_base", "_free_slots", "changed", "entries", "follows", "plain", "program", "repeated", "revision")
 
     def __init__(
         self,
@@ -56,7 +55,7 @@ class Hyperparameters:
         self.changed = changed
         self.follows = follows
         self.plain = plain
-        self.start: tuple[list[Any], dict[str, int], Attempts] | None = None
+        self.repeated: tuple[CompiledRun, list[Any], dict[str, int]] | None = None
         self._base: list[Any] | None = None
         self._free_slots: dict[str, int] | None = None
 
@@ -149,7 +148,7 @@ class Hyperparameters:
         for token, value in payload.items():
             slot = free.get(token)
             if slot is None:
-                raise wrong_payload(self.program.cg, token, free)
+                raise self._wrong_payload(token)
             values[slot] = value
             require_reusable(value, self.program, slot)
         if self.program.selectors:
@@ -190,3 +189,15 @@ class Hyperparameters:
             f"Token {token!r} is a free source token, not a hyperparameter. "
             f"Pass it to run({token}=...), or make it one: freeze({token}=...).",
         )
+
+    def _wrong_payload(self, token: str) -> Exception:
+        """Return the error that says why a token can't be given to ``run``."""
+        cg = self.program.cg
+        if token not in cg.tokens:
+            return UnknownName("token", token, self.free_slots)
+        maker = cg.digraph.producer.get(token)
+        if maker is not None:
+            text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
+        else:
+            text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
+        return PayloadError((token,), text)

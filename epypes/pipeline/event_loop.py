@@ -1,27 +1,94 @@
-"""The thread that takes events from a queue, and its end."""
+"""The thread that takes events from a queue, and the settling of events that a broker keeps.
+
+An event that a broker keeps has ``ack``, ``reject`` and ``nack``. They are looked up in its class, so that events can
+be anything.
+"""
 
 from __future__ import annotations
 
 import atexit
+import logging
 import queue
 import threading
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
-from epypes.errors import StillRunning
-from epypes.pipeline.log import log_error
-from epypes.pipeline.settling import settle
+from epypes.errors import BrokerError, StillRunning
 
 # How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
 # woken without putting a sentinel into them, which would be an event of theirs.
-POLL_S = 0.05
+POLL_S: Final = 0.05
 # Of a queue that has been empty for a while: to wake up takes up to 100 us of a core.
-LONGEST_POLL_S = 0.2
+LONGEST_POLL_S: Final = 0.2
+
+_log: Final = logging.getLogger("epypes.pipeline")
 
 _left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
+
+
+def log_error(text: str, *parts: object, error: BaseException | None) -> None:
+    """Log an error with its traceback, or without, if the exception does not let itself be shown."""
+    try:
+        _log.error(text, *parts, exc_info=error)
+    except BaseException:  # a SystemExit of its __notes__ passes through logging, and would end the thread
+        _log.error(f"{text} (its traceback can't be had)", *parts)
+
+
+def is_kept(event: Any) -> bool:
+    """Whether a broker keeps an event until it is acknowledged or rejected."""
+    return getattr(type(event), "ack", None) is not None
+
+
+def settle(event: Any, error: BaseException | None = None, text: str = "") -> None:
+    """Acknowledge, reject or return an event that has such methods; raises nothing.
+
+    Parameters
+    ----------
+    event
+        Any object.
+    error
+        Why it failed; None if it did not. After a BrokerError the outcome is unknown: ``nack`` is called if the event
+        has it, and otherwise nothing, so that the broker delivers it again.
+    text
+        The reason it is rejected with; that of the error without.
+    """
+    kind = type(event)
+    if not is_kept(event):
+        return
+    if error is None:
+        _call(kind.ack, event)
+    elif issubclass(type(error), BrokerError):
+        if hasattr(kind, "nack"):
+            _call(kind.nack, event)
+    else:
+        reject(event, text or _text_of(error))
+
+
+def reject(event: Any, reason: str) -> None:
+    """Reject an event with a reason, if its class has the method; raises nothing."""
+    found = getattr(type(event), "reject", None)
+    if found is not None:
+        _call(found, event, reason)
+
+
+def _call(method: Any, event: Any, *reason: str) -> None:
+    try:
+        method(event, *reason)
+    except KeyboardInterrupt:  # the user's, which does not concern the event
+        raise
+    except BaseException as exception:
+        log_error("an event could not be settled", error=exception)
+
+
+def _text_of(error: BaseException) -> str:
+    kind = type(error).__name__
+    try:
+        return f"{kind}: {error}"
+    except BaseException:  # an exception's own __str__ may raise
+        return kind
 
 
 class EventLoop:
@@ -164,7 +231,8 @@ class EventLoop:
                 self._report(event, exception)
                 self._settle(event, exception)
             else:
-                self._settle(event, None)
+                if is_kept(event):
+                    self._settle(event, None)
             poll_s = POLL_S
             # An event may be large: it shall not live on until another comes.
             del event
