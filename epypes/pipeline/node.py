@@ -7,10 +7,14 @@ import itertools
 from collections.abc import Callable, Mapping
 from time import perf_counter_ns
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from weakref import ref
 
 from epypes.graph import CompGraph, with_functions
 from epypes.run.guard import WATCH, called_for
+
+if TYPE_CHECKING:
+    from epypes.run.program import Program
 
 
 class Node:
@@ -24,13 +28,6 @@ class Node:
         Its name in graphs and reports.
     func
         What it computes.
-
-    Attributes
-    ----------
-    duration_ns
-        How long the last call took, in nanoseconds; 0 before the first.
-    run_count
-        How often it was called, failed calls included.
 
     Notes
     -----
@@ -48,10 +45,12 @@ class Node:
             raise TypeError(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
         self.name = name
         self.func = called_for(name, func)
-        self.duration_ns = 0
-        self.run_count = 0
+        # Nanoseconds of the last call, and how many there were.
+        self._called = (0, 0)
         # Whole in every thread, which counting up is not.
         self._next_count = itertools.count(1).__next__
+        # Those that call ``func`` in the node's place; they know of calls that are not counted yet.
+        self.programs: list[ref[Program]] = []
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func, updated=())
         # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
@@ -69,9 +68,26 @@ class Node:
             self.count_call(perf_counter_ns() - start_ns)
 
     def count_call(self, duration_ns: int) -> None:
-        """Take note of a call; a run, which calls ``func`` in the node's place, does so when it has ended."""
-        self.duration_ns = duration_ns
-        self.run_count = self._next_count()
+        """Take note of a call."""
+        self._called = duration_ns, self._next_count()
+
+    @property
+    def duration_ns(self) -> int:
+        """How long the last call took, in nanoseconds; 0 before the first."""
+        self._count_runs()
+        return self._called[0]
+
+    @property
+    def run_count(self) -> int:
+        """How often the node was called, failed calls included."""
+        self._count_runs()
+        return self._called[1]
+
+    def _count_runs(self) -> None:
+        for found in tuple(self.programs):
+            program = found()
+            if program is not None:
+                program.count_calls()
 
     @property
     def time(self) -> float:
@@ -84,7 +100,7 @@ class Node:
 
     @property
     def __epypes_is_its_func__(self) -> bool:
-        """Whether it comes to the same to call ``func``, and ``count_call`` later."""
+        """Whether it comes to the same to call ``func``, and to count the call later."""
         kind = type(self)
         return kind.__call__ is Node.__call__ and kind.compute is Node.compute and "compute" not in vars(self)
 

@@ -128,7 +128,7 @@ class EventView(Mapping[str, Any]):
 
     def now_ns(self) -> int:
         """Return the time at this moment, by the event's clock: nanoseconds of Unix time."""
-        return self.unix_ns(perf_counter_ns())
+        return (self._offset_ns or self.unix_ns(1) - 1) + perf_counter_ns()
 
     @property
     def report(self) -> RunReport:
@@ -291,6 +291,8 @@ class SinkPipeline(Pipeline):
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
         view = EventView(self.name, event)
         self._events[get_ident()] = view
+        # Looked up now: a function of the graph fills the caches with its image, and each look-up takes microseconds.
+        clock, f_out, put = perf_counter_ns, self._emits_by(), self.put
         # To free the tokens of the run before takes its time: that is done when the answer is on its way.
         before = self.runner.last
         run: Run | None = None
@@ -302,7 +304,15 @@ class SinkPipeline(Pipeline):
             view.stage = "graph"
             run = self.run(**payload)
             view.stage = "f_out"
-            self.emit(event, run)
+            if f_out is None:
+                self.emit(event, run)
+            else:
+                view.run, view.attributes = run, self.attributes.copy()
+                view.f_out_start = clock()
+                answer = f_out(view)
+                view.f_out_end = clock()
+                view.stage = "q_out"
+                put(answer, view)
             view.stage = ""
         except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
             self._fail(view, exception, run)
@@ -345,6 +355,13 @@ class SinkPipeline(Pipeline):
 
     def emit(self, event: Any, run: Run) -> None:
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
+
+    def put(self, answer: Any, view: EventView) -> None:
+        """Put an answer on q_out; a SinkPipeline has none. The hook for subclasses."""
+
+    def _emits_by(self) -> FOut | None:
+        """Return the f_out whose answer `handle` puts on q_out itself; None if it is to call `emit`."""
+        return None
 
     def _fail(self, view: EventView, exception: BaseException, run: Run | None) -> None:
         event, where = view.event, "f_out" if view.stage == "q_out" else view.stage
@@ -468,6 +485,10 @@ class FullPipeline(_Answering, SinkPipeline):
     ) -> None:
         super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
+        self._has_usual_emit = type(self).emit is FullPipeline.emit
+
+    def _emits_by(self) -> FOut | None:
+        return self.f_out if self._has_usual_emit else None
 
     @property
     def stages(self) -> Stages:

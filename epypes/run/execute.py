@@ -10,7 +10,7 @@ import heapq
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from contextvars import copy_context
 from functools import partial
 from sys import getrefcount
@@ -20,14 +20,27 @@ from typing import Any, Final
 
 from epypes.errors import ContractBroken, InputMutated, OutputArityError
 from epypes.images import Image
-from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LONG, array_type, is_array, keep, lend, writable
+from epypes.run.guard import (
+    ARRAYLESS,
+    FRESH,
+    FRESH_HERE,
+    FRESH_OWNER,
+    HARMLESS,
+    LONG,
+    array_type,
+    is_array,
+    keep,
+    lend,
+    writable,
+)
 from epypes.run.program import Program, Step
 from epypes.run.snapshot import Snapshot
 from epypes.run.staleness import TokenManager, is_unchanged
 from epypes.run.timing import longest_path_ns
 
-# Runs its steps on tokens, and writes nanoseconds by step.
-CompiledRun = Callable[[TokenManager, list[int]], None]
+# Runs its steps on values by slot and dirty flags by step (None from scratch), and writes nanoseconds by step. The step
+# that is running is an attribute of its first argument.
+CompiledRun = Callable[[Any, list[Any], bytearray | None, dict[int, int]], None]
 
 # Compiling takes some 40 us per function, once: worth it for what is repeated, and a pause below 20 ms.
 RUNS_BEFORE: Final = 3
@@ -65,7 +78,7 @@ class Executor:
         self._gains: dict[Hashable, Gain] = {}
 
     def execute(
-        self, tokens: TokenManager, wanted: bytes | None, durations_ns: list[int], plain: frozenset[str],
+        self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int], plain: frozenset[str],
         changed: tuple[str, ...] = (),
     ) -> tuple[bool, BaseException | None]:  # fmt: skip
         """Run the dirty steps, those included that become dirty on the way.
@@ -77,7 +90,7 @@ class Executor:
         wanted
             By step, 1 for those that may run; all of them for None.
         durations_ns
-            By step; gets the nanoseconds of those that ran.
+            Gets the nanoseconds of each step that ran.
         plain
             The tokens whose values hold no arrays in any run with these.
         changed
@@ -97,7 +110,7 @@ class Executor:
             if side_by_side:
                 SideBySide(tokens, wanted, durations_ns, self._workers).run()
             elif (compiled := self._find(key, tokens, wanted, plain, changed)) is not None:
-                compiled(tokens, durations_ns)
+                compiled(tokens, tokens.values, tokens.dirty, durations_ns)
                 if tokens.origin is None:
                     left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
                     tokens.dirty = bytearray(left_out)
@@ -152,7 +165,7 @@ _INVERTED: Final = bytes((1, 0)).ljust(256)
 # -- one call ---------------------------------------------------------------------------------------------------------
 
 
-def call(tokens: TokenManager, step: Step, durations_ns: list[int]) -> Sequence[Any]:
+def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict[int, int]) -> Sequence[Any]:
     """Call a step's function on the values of its inputs; return one value per output token, guarded.
 
     Raises
@@ -164,7 +177,6 @@ def call(tokens: TokenManager, step: Step, durations_ns: list[int]) -> Sequence[
     """
     # Unpacked at once: to look up one field of a named tuple takes as long.
     place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, _ = step
-    program, values = tokens.program, tokens.values
     start_ns = 0
     try:
         if is_plain:
@@ -262,16 +274,17 @@ def unpack(program: Program, step: Step, result: Any, values: Sequence[Any]) -> 
 # -- one by one -------------------------------------------------------------------------------------------------------
 
 
-def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: list[int]) -> None:
+def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
     """Run the dirty steps in run order."""
-    steps, next_dirty, store = tokens.program.steps, tokens.dirty.find, tokens.store
+    program, values, next_dirty, store = tokens.program, tokens.values, tokens.dirty.find, tokens.store
+    steps = program.steps
     # What depends on a step comes after it, so one pass over the flags finds everything.
     place = next_dirty(1)
     while place >= 0:
         if wanted is None or wanted[place]:
             tokens.running = place
             step = steps[place]
-            store(step, call(tokens, step, durations_ns))
+            store(step, call(program, step, values, durations_ns))
         place = next_dirty(1, place + 1)
 
 
@@ -287,6 +300,7 @@ _NAMES: Final = {
     "LONG": LONG,
     "FRESH": FRESH,
     "FRESH_HERE": FRESH_HERE,
+    "FRESH_OWNER": FRESH_OWNER,
     "lend": lend,
     "keep": keep,
     "call": call,
@@ -343,13 +357,8 @@ class _Source:
         lines = [
             f"def make(program, steps, {', '.join(_NAMES)}, array):",
             *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
-            "    def run(t, d):",
-            "        v = t.values",
-            *(
-                []
-                if self._is_first
-                else ["        D = t.dirty", *(f"        D[{place}] = 1" for place in self._marked)]
-            ),
+            "    def run(t, v, D, d):",
+            *(f"        D[{place}] = 1" for place in self._marked),
             "        start = 0",
             "        try:",
             *(f"            {line}" for step in self._steps for line in self._step(step)),
@@ -397,7 +406,7 @@ class _Source:
         """Write out the call of a step, whose values are then ``m0``, ``m1`` and so on."""
         program, made = self._program, [f"m{place}" for place in range(len(step.outputs))]
         if not step.is_plain and (program.guard or step.contracts or program.check_mutation or step.switch is not None):
-            yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(t, steps[{step.place}], d)"
+            yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(program, steps[{step.place}], v, d)"
             return
         args = [f"v[{slot}]" for slot in step.inputs]
         for place, slot in enumerate(step.inputs):
@@ -448,7 +457,9 @@ class _Source:
         """Write out ``keep``; an array that no function reads need not be locked."""
         kind, general = self._kind(slot), f"{name} = keep({name}, FRESH, program, {slot}, v)"
         if kind is self._array:
-            yield f"if kind({name}) is array and {name}.base is None and count({name}) <= FRESH_HERE:"
+            owner = "kind(b) is array and b.base is None and count(b) <= FRESH_OWNER"
+            base = f"(b := {name}.base) is None or {owner}"
+            yield f"if kind({name}) is array and count({name}) <= FRESH_HERE and ({base}):"
             yield f"    {name}.setflags(False)" if self._program.consumers[slot] else "    pass"
             yield f"else: {general}"
         elif kind is tuple:
@@ -494,7 +505,7 @@ class SideBySide:
     daemons: the interpreter exits while a function never returns.
     """
 
-    def __init__(self, tokens: TokenManager, wanted: bytes | None, durations_ns: list[int], workers: int) -> None:
+    def __init__(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int], workers: int) -> None:
         program, values = tokens.program, tokens.values
         self._tokens, self._durations_ns, self._workers = tokens, durations_ns, workers
         self._before = values.copy(), tokens.dirty.copy()
@@ -535,10 +546,10 @@ class SideBySide:
                 if place < failed_at:
                     tokens.store(tokens.program.steps[place], self._made[place])
                 else:
-                    self._durations_ns[place] = -1
+                    del self._durations_ns[place]
             for place in self._failures:
                 if place != failed_at:
-                    self._durations_ns[place] = -1
+                    del self._durations_ns[place]
             tokens.running = failed_at
             raise self._failures[failed_at]
 
@@ -564,7 +575,7 @@ class SideBySide:
         program.running.add(mark)
         self._changed.release()
         try:
-            made = call(tokens, step, self._durations_ns)
+            made = call(program, step, tokens.values, self._durations_ns)
         except BaseException as exception:
             failure = exception
         finally:
@@ -631,8 +642,8 @@ class Gain:
         is_faster = min(self._side_by_side_ns) < min(self._one_by_one_ns)
         return is_faster != (self._asked % _TRY_AGAIN_AFTER == 0)
 
-    def learn(self, durations_ns: Sequence[int], total_ns: int, side_by_side: bool) -> None:
-        """Take note of a run that has ended without a failure: nanoseconds by step, -1 for none, and in all."""
+    def learn(self, durations_ns: Mapping[int, int], total_ns: int, side_by_side: bool) -> None:
+        """Take note of a run that has ended without a failure: nanoseconds by step, and in all."""
         if side_by_side:
             self._side_by_side_ns.append(total_ns)
             return
@@ -641,11 +652,11 @@ class Gain:
         if is_known and not self._is_promising and self._asked % LOOK_AGAIN_AFTER:
             return
         self._one_by_one_ns.append(total_ns)
-        work_ns = sum(duration for duration in durations_ns if duration > 0)
+        work_ns = sum(durations_ns.values())
         best_ns = max(longest_path_ns(self._program, durations_ns), work_ns // self._workers)
         self._is_promising = work_ns - best_ns > max(_MIN_GAIN_NS, _MIN_SHARE * total_ns)
 
 
 def has_independent_steps(program: Program) -> bool:
     """Whether any two functions could run side by side."""
-    return longest_path_ns(program, [1] * len(program.steps)) < len(program.steps)
+    return longest_path_ns(program, {step.place: 1 for step in program.steps}) < len(program.steps)

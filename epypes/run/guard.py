@@ -262,7 +262,7 @@ def _own(array: Any, is_known: bool, program: Program, slot: int, values: Sequen
         return array
     is_writable = array.flags.writeable
     while type(owner) is _ndarray or is_array(owner):
-        if (is_writable or owner.flags.writeable) and getrefcount(owner) > _FRESH_OWNER:
+        if (is_writable or owner.flags.writeable) and getrefcount(owner) > FRESH_OWNER:
             return array if not is_writable and _is_input(owner, program, slot, values) else _copy(array)
         owner = owner.base
         if owner is None:
@@ -419,4 +419,4 @@ def _measure_fresh() -> tuple[int, int, int, int]:
     return _count(result, 0), getrefcount(result), getrefcount(owner), item
 
 
-FRESH, FRESH_HERE, _FRESH_OWNER, _FRESH_ITEM = _measure_fresh()
+FRESH, FRESH_HERE, FRESH_OWNER, _FRESH_ITEM = _measure_fresh()

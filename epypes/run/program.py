@@ -6,10 +6,12 @@ A graph is compiled once: tokens become slot numbers, functions become steps in 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, Final, NamedTuple
+from weakref import ref
 
 from epypes.graph import CompGraph, Switch, as_switch
 from epypes.graph.checks import distinct
@@ -22,6 +24,7 @@ REVISION: Final = "__epypes_revision__"
 # What a function has that measures its calls: where it is true, a program calls its ``func`` in its place, and has it
 # count the call when the run has ended.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
+_MAX_UNCOUNTED: Final = 100
 # More objects than any function refers to on purpose.
 _MOST_REACHED: Final = 1_000
 
@@ -83,6 +86,10 @@ class Program:
         The steps that are one.
     nodes
         The steps that have a node, with it.
+    clean
+        The dirty flags of a run in which every step is up to date.
+    uncounted
+        Of runs that have ended, nanoseconds by step, for nodes to count; if there are nodes.
     running
         What runs at this moment, in any thread: objects whose ``running`` is a step, or -1.
     selectors
@@ -97,7 +104,11 @@ class Program:
         self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
         self.steps = steps = tuple(_steps(cg, slots, guard and not check_mutation))
         self.nodes = tuple((step.place, step.node) for step in steps if step.node is not None)
+        self.uncounted: deque[Mapping[int, int]] = deque()
+        for _, node in self.nodes:
+            node.programs.append(ref(self, node.programs.remove))
         self.running: set[Any] = set()
+        self.clean = bytes(len(steps))
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
@@ -154,14 +165,23 @@ class Program:
 
     def running_functions(self) -> tuple[str, ...]:
         """Return the functions that were called and have not returned, in run order."""
-        places = {each.running for each in tuple(self.running)}
+        places = {getattr(each, "running", -1) for each in tuple(self.running)}
         return tuple(self.steps[place].name for place in sorted(places) if place >= 0)
 
-    def count_calls(self, durations_ns: Sequence[int]) -> None:
-        """Have the nodes count their calls in a run: nanoseconds by step, -1 for those that did not run."""
-        for place, node in self.nodes:
-            if durations_ns[place] >= 0:
-                node.count_call(durations_ns[place])
+    def note_calls(self, durations_ns: Mapping[int, int]) -> None:
+        """Take note of the calls of nodes in a run that has ended."""
+        self.uncounted.append(durations_ns)
+        if len(self.uncounted) > _MAX_UNCOUNTED:
+            self.count_calls()
+
+    def count_calls(self) -> None:
+        """Have the nodes count the calls of the runs that have ended; done when a node is asked for them."""
+        with contextlib.suppress(IndexError):
+            while True:
+                durations_ns = self.uncounted.popleft()
+                for place, node in self.nodes:
+                    if place in durations_ns:
+                        node.count_call(durations_ns[place])
 
     def downstream(self, starts: Iterable[int], values: Sequence[Any]) -> set[int]:
         """Return these steps and every step that, with these values, depends on one of them."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph import CompGraph
@@ -20,65 +21,81 @@ if TYPE_CHECKING:
     from weakref import ref
 
 
+# Values by slot, dirty flags by step, whether every source token has a value, the revisions of nested pipelines, the
+# hyperparameters with their versions, times, failure.
+Record = tuple[list[Any], bytes, bool, tuple[Any, ...], Hyperparameters, Times, Failure | None]
+
+# The state of a runner when a trial began: the runner's key, its hyperparameters, its last run. That one is not kept
+# alive, since a run's memory is that of its images.
+TrialOf = tuple[object, Hyperparameters, "ref[Run] | None"]
+
+
 class Run(Mapping[str, Any]):
     """A run that has ended: a mapping from tokens to values, which does not change any more.
 
     Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
     draw on a copy, ``run["edges"].copy()``. A payload array is not copied: if its owner fills it again, the run and its
     picture show what is in it then.
-
-    Attributes
-    ----------
-    tokens
-        The token store.
-    failure
-        None, or the function that failed; the tokens that were computed before keep their values.
     """
 
-    __slots__ = ("__weakref__", "failure", "hparams", "times", "tokens", "trial_of")
+    # While it runs, ``running`` is its step. Then one tuple is set, and nothing else: what is made of it is made when
+    # it is read, since to record a run takes a good part of what EPypes adds to its functions.
+    __slots__ = ("__weakref__", "_tokens", "record", "running", "trial_of")
+    running: int
+    trial_of: TrialOf
 
-    def __init__(
-        self, tokens: TokenManager, hparams: Hyperparameters, times: Times, failure: Failure | None = None
-    ) -> None:
-        self.tokens, self.hparams, self.times, self.failure = tokens, hparams, times, failure
-        # Of a trial, the state of its runner when it began: the runner's key, its hyperparameters, its last run. That
-        # one is not kept alive, since a run's memory is that of its images.
-        self.trial_of: tuple[object, Hyperparameters, ref[Run] | None] | None = None
+    def __init__(self, record: Record) -> None:
+        self.record = record
 
     @property
     def report(self) -> RunReport:
         """The times of the run."""
-        return RunReport(*self.times)
+        return RunReport(*self.record[5])
+
+    @property
+    def failure(self) -> Failure | None:
+        """None, or the function that failed; the tokens that were computed before keep their values."""
+        return self.record[6]
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
         """The values that the run was computed with."""
-        return self.hparams.values
+        return self.record[4].values
 
     @property
     def first_hyperparameters(self) -> Mapping[str, Any]:
         """The values that they had when they were made or frozen, by token."""
-        return self.hparams.first_values
+        return self.record[4].first_values
 
     @property
     def revision(self) -> int:
         """The runner's count of hyperparameter changes when the run began."""
-        return self.hparams.revision
+        return self.record[4].revision
 
     @property
     def cg(self) -> CompGraph:
         """The graph that was run."""
-        return self.tokens.program.cg
+        return self.record[4].program.cg
+
+    @property
+    def tokens(self) -> TokenManager:
+        """The token store."""
+        try:
+            return self._tokens
+        except AttributeError:
+            values, dirty, has_payload, revisions, hparams, _, _ = self.record
+            self._tokens: TokenManager = TokenManager(hparams.program, values, bytearray(dirty), has_payload, revisions)
+            return self._tokens
 
     def __getitem__(self, token: str) -> Any:
-        tokens = self.tokens
+        values, dirty, has_payload, _, hparams, _, _ = self.record
         # Of a run that is whole every token has a value, and none is out of date.
-        slot = tokens.program.slots.get(token)
-        if slot is not None and tokens.has_payload and 1 not in tokens.dirty:
-            value = tokens.values[slot]
-            return value if type(value) in ARRAYLESS or not tokens.program.guard else lend(value)
+        slot = hparams.program.slots.get(token)
+        if slot is not None and has_payload and 1 not in dirty:
+            value = values[slot]
+            return value if type(value) in ARRAYLESS or not hparams.program.guard else lend(value)
         try:
-            return tokens.read(token)
+            return self.tokens.read(token)
         except StaleToken:
             raise
         except NotComputed as error:
@@ -159,9 +176,13 @@ class RunImporter:
                 slots[program.slots[token]] = value
         entries = {token: (value, first.get(token, value)) for token, value in hyperparameters.items()}
         # No function is out of date; but not every token has a value, so the run must not be taken for a whole one.
-        store = TokenManager(program, slots, bytearray(len(program.steps)), False)
         known = durations_ns or {}
-        by_step = [known.get(step.name, -1) for step in program.steps]
+        by_step = {step.place: known[step.name] for step in program.steps if step.name in known}
         failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
         times = (program, None, by_step, total_ns, False, failed_at)
-        return Run(store, Hyperparameters(program, entries, revision), times, failure)
+        hparams = Hyperparameters(program, entries, revision)
+        return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
+
+
+# Half the time of Run(...).
+new_run: Final[Callable[[], Run]] = partial(object.__new__, Run)

@@ -19,7 +19,7 @@ from epypes.run.guard import COPIERS, lend, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import Program
-from epypes.run.result import Run
+from epypes.run.result import Run, TrialOf, new_run
 from epypes.run.staleness import TokenManager
 from epypes.run.timing import Reports
 from epypes.wording import counted
@@ -151,7 +151,7 @@ class CompGraphRunner:
         hparams, program = self._hparams, self._program
         repeated = hparams.repeated
         if repeated is None or targets or len(payload) != len(repeated[2]):
-            return self._end(self._run_from_scratch(hparams, payload, targets, start_ns))
+            return self._run_from_scratch(hparams, payload, targets, start_ns, None)
         # A stream of images goes this way: as short as can be.
         compiled, base, slots = repeated
         values = base.copy()
@@ -161,21 +161,26 @@ class CompGraphRunner:
                 if type(value) not in COPIERS:
                     require_reusable(value, program, slots[token])
         except KeyError:
-            return self._end(self._run_from_scratch(hparams, payload, targets, start_ns))
-        tokens = TokenManager(program, values, bytearray(len(program.steps)), True)
-        return self._end(self._repeat(compiled, tokens, hparams, None, start_ns))
+            return self._run_from_scratch(hparams, payload, targets, start_ns, None)
+        return self._repeat(compiled, values, None, None, hparams, start_ns, None)
 
     def _run_from_scratch(
-        self, hparams: Hyperparameters, payload: Payload, targets: Sequence[str], start_ns: int
+        self,
+        hparams: Hyperparameters,
+        payload: Payload,
+        targets: Sequence[str],
+        start_ns: int,
+        trial_of: TrialOf | None,
     ) -> Run:
         """Run everything that the targets need, everything without, on a payload."""
         self._require_targets(targets)
         values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
-        tokens = TokenManager(self._program, values, bytearray(b"\1") * len(self._program.steps), has_payload)
-        run = self._run(tokens, hparams, targets, payload, start_ns)
-        if hparams.repeated is None and (compiled := self._executor.whole(hparams.plain)) is not None:
-            hparams.repeated = compiled, hparams.base, hparams.free_slots
-        return run
+        tokens = TokenManager.from_scratch(self._program, values, has_payload)
+        try:
+            return self._run(tokens, hparams, targets, payload, start_ns, trial_of)
+        finally:
+            if hparams.repeated is None and (compiled := self._executor.whole(hparams.plain)) is not None:
+                hparams.repeated = compiled, hparams.base, hparams.free_slots
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -191,108 +196,134 @@ class CompGraphRunner:
         Exception
             Whatever a function raises, unchanged, with a note.
         """
+        return self._go_on(changes, targets, False)
+
+    def _go_on(self, changes: Mapping[str, Any], targets: tuple[str, ...], is_trial: bool) -> Run:
+        """Change hyperparameters, and run the stale functions on the tokens of the last run."""
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
+        program = self._program
         with self._lock:
-            hparams, last = self._hparams.frozen(changes, also_new=False), self.last
-            self._hparams = hparams
-        run = self._go_on(last, hparams, targets, start_ns)
-        # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too ...
-        del last
-        return self._end(run)
-
-    def _go_on(self, last: Run | None, hparams: Hyperparameters, targets: tuple[str, ...], start_ns: int) -> Run:
-        """Run the stale functions that the targets need, all without, on the tokens of a run."""
+            first, last = self._hparams, self.last
+            hparams = first.frozen(changes, also_new=False)
+            if not is_trial:
+                self._hparams = hparams
         if last is None:
             free = self.free_source_tokens
             raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first.")
-        program, before = self._program, last.tokens
-        if hparams.follows == last.hparams.revision and before.has_payload and not program.revised:
+        trial_of = (self._key, first, ref(last)) if is_trial else None
+        values, dirty, has_payload, _, before, _, _ = last.record
+        if hparams.follows == before.revision and has_payload and not program.revised:
             # A slider goes this way: as short as can be.
-            changed, wanted, dirty = hparams.changed, self._wanted.get(targets), bytes(before.dirty)
-            compiled = self._executor.repeated.get((hparams.plain, wanted, dirty, tuple(changed)))
+            changed, wanted = hparams.changed, self._wanted.get(targets) if targets else None
+            compiled = self._executor.repeated.get((hparams.plain, wanted, dirty, (*changed,)))
             if compiled is not None and (wanted is not None or not targets):
-                values = before.values.copy()
+                values = values.copy()
                 for token, value in changed.items():
                     values[program.slots[token]] = value
-                tokens = TokenManager(program, values, before.dirty.copy(), True, dirty)
-                return self._repeat(compiled, tokens, hparams, wanted, start_ns)
-        tokens = before.branch()
-        new = tokens.change(hparams.changes_since(last.hparams))
-        return self._run(tokens, hparams, targets, (), start_ns, new)
+                # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too.
+                del last
+                return self._repeat(compiled, values, dirty, wanted, hparams, start_ns, trial_of)
+        tokens = last.tokens.branch()
+        del last, values
+        new = tokens.change(hparams.changes_since(before))
+        return self._run(tokens, hparams, targets, (), start_ns, trial_of, new)
 
     def _run(
         self, tokens: TokenManager, hparams: Hyperparameters, targets: Sequence[str], payload: Collection[str],
-        start_ns: int, changed: tuple[str, ...] = (),
+        start_ns: int, trial_of: TrialOf | None, changed: tuple[str, ...] = (),
     ) -> Run:  # fmt: skip
-        """Run the dirty steps that the targets need, all without; return the run, whether it failed or not."""
+        """Run the dirty steps that the targets need, all without; make the run the last one unless it is a trial."""
         program = self._program
         wanted = wanted_steps(program, tokens.values, targets) if targets or program.switches else None
         if program.placeholders or not tokens.has_payload:
             check_ready(program, tokens.values, wanted, payload)
         if wanted is not None and not program.switches and len(self._wanted) < _MAX_TARGETS:
             self._wanted[tuple(targets)] = wanted
-        durations_ns = [-1] * len(program.steps)
+        durations_ns: dict[int, int] = {}
         side_by_side, error = self._executor.execute(tokens, wanted, durations_ns, hparams.plain, changed)
         if error is not None:
-            return self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error, side_by_side)
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1
-        if program.nodes:
-            program.count_calls(durations_ns)
-        return Run(tokens, hparams, times)
+            run = self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error, side_by_side)
+        else:
+            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1
+            program.note_calls(durations_ns)
+            dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
+            run = Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, None))
+        return self._end(run, trial_of)
 
     def _repeat(
-        self, compiled: CompiledRun, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, start_ns: int
-    ) -> Run:
-        """Do what ``_run`` does, with a compiled run."""
+        self, compiled: CompiledRun, values: list[Any], origin: bytes | None, wanted: bytes | None,
+        hparams: Hyperparameters, start_ns: int, trial_of: TrialOf | None,
+    ) -> Run:  # fmt: skip
+        """Do what ``_run`` does, with a compiled run; ``origin`` are the dirty steps, None from scratch."""
         program, error = self._program, None
-        durations_ns = [-1] * len(program.steps)
-        program.running.add(tokens)
+        revisions = program.revisions() if program.revised else ()
+        durations_ns: dict[int, int] = {}
+        dirty = None if origin is None else bytearray(origin)
+        run = new_run()
+        program.running.add(run)
         try:
-            compiled(tokens, durations_ns)
+            compiled(run, values, dirty, durations_ns)
         except BaseException as raised:
             error = raised
-        program.running.discard(tokens)
+        program.running.discard(run)
         if error is not None:
-            return self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error)
+            tokens = TokenManager(program, values, dirty or bytearray(program.clean), True, revisions)
+            tokens.running, tokens.origin = getattr(run, "running", 0), origin
+            return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
         times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        run.record = values, program.clean if dirty is None else bytes(dirty), True, revisions, hparams, times, None
         if program.nodes:
-            program.count_calls(durations_ns)
-        return Run(tokens, hparams, times)
+            program.note_calls(durations_ns)
+        if trial_of is not None:
+            run.trial_of = trial_of
+            return run
+        with self._lock:
+            self.last = run
+        self.reports.kept.append(times)
+        if self._watchers:
+            self._tell_watchers()
+        return run
 
     def _failed_run(
-        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: list[int],
+        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: dict[int, int],
         start_ns: int, error: BaseException, side_by_side: bool = False,
     ) -> Run:  # fmt: skip
         """Return what is left of a run in which a step raised: the step that was running."""
         program, failed_at = self._program, max(0, tokens.running)
         total_ns = perf_counter_ns() - start_ns
-        durations_ns[failed_at] = max(0, durations_ns[failed_at])
-        program.count_calls(durations_ns)
+        durations_ns.setdefault(failed_at, 0)
+        program.note_calls(durations_ns)
         if tokens.origin is None:
-            tokens.dirty = bytearray(duration_ns < 0 for duration_ns in durations_ns)
+            tokens.dirty = bytearray(step.place not in durations_ns for step in program.steps)
         failure = failure_of(tokens, failed_at, error)
         tokens.forget(program.downstream([failed_at], tokens.values))
         # Of the steps that were not reached none was reused.
         reached = bytearray(wanted or b"\1" * len(program.steps))
         for place in tokens.stale:
             reached[place] = 0
-        return Run(tokens, hparams, (program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at), failure)
+        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at
+        dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
+        return Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, failure))
 
-    def _end(self, run: Run) -> Run:
-        """Make a run the last one; raise the user's exception if a function failed.
+    def _end(self, run: Run, trial_of: TrialOf | None) -> Run:
+        """Make a run the last one unless it is a trial; raise the user's exception if a function failed.
 
         To be called where no exception is being handled, which would become the context of the user's.
         """
+        if trial_of is not None:
+            run.trial_of = trial_of
+            return run
         with self._lock:
             self.last = run
-        self.reports.add(run.times)
+        *_, times, failure = run.record
+        self.reports.add(times)
         if self._watchers:
             self._tell_watchers()
-        if run.failure is not None:
+        if failure is not None:
             self._failed.run = ref(run)
-            raise run.failure.exception
+            raise failure.exception
         return run
 
     def failed_run(self, exception: BaseException) -> Run | None:
@@ -323,17 +354,13 @@ class CompGraphRunner:
         HyperparameterError, PayloadError, PlaceholderNeeded, UnknownName
             As ``rerun`` and ``run`` do.
         """
+        if payload is None:
+            return self._go_on(values, targets, True)
         start_ns = perf_counter_ns()
-        if targets:
-            self._require_targets(targets)
         before, last = self._state
         hparams = before.frozen(values, also_new=False)
-        if payload is None:
-            run = self._go_on(last, hparams, targets, start_ns)
-        else:
-            run = self._run_from_scratch(hparams, payload, targets, start_ns)
-        run.trial_of = self._key, before, None if last is None else ref(last)
-        return run
+        trial_of = self._key, before, None if last is None else ref(last)
+        return self._run_from_scratch(hparams, payload, targets, start_ns, trial_of)
 
     def adopt(self, run: Run, /) -> bool:
         """Make a run of ``trial`` the last one and its hyperparameters the runner's, in one step.
@@ -345,14 +372,14 @@ class CompGraphRunner:
         ValueError
             The run was not tried by this runner.
         """
-        if run.trial_of is None or run.trial_of[0] is not self._key:
+        key, before, last = getattr(run, "trial_of", (None, None, None))
+        if key is not self._key:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
-        _, before, last = run.trial_of
         with self._lock:
             if before is not self._hparams or (None if last is None else last()) is not self.last:
                 return False
-            self._hparams, self.last = run.hparams, run
-        self.reports.add(run.times)
+            self._hparams, self.last = run.record[4], run
+        self.reports.add(run.record[5])
         self._tell_watchers()
         return True
 
@@ -383,7 +410,7 @@ class CompGraphRunner:
         """Return what ``rerun(*targets)`` would do, and why."""
         self._require_targets(targets)
         hparams, last = self._state
-        changed = () if last is None else tuple(hparams.changes_since(last.hparams))
+        changed = () if last is None else tuple(hparams.changes_since(last.record[4]))
         return plan(self._tokens_now(hparams, last), targets, changed, hparams)
 
     def _require_targets(self, targets: Sequence[object]) -> None:
@@ -469,12 +496,11 @@ class CompGraphRunner:
         Both are given, so that what is read beside a rerun in another thread is decided from one state.
         """
         if last is None:
-            dirty = bytearray(b"\1") * len(self._program.steps)
-            return TokenManager(self._program, hparams.base.copy(), dirty, not hparams.free_slots)
-        if last.hparams is hparams and not self._program.revised:
+            return TokenManager.from_scratch(self._program, hparams.base.copy(), not hparams.free_slots)
+        if last.record[4] is hparams and not self._program.revised:
             return last.tokens
         tokens = last.tokens.branch()
-        tokens.change(hparams.changes_since(last.hparams))
+        tokens.change(hparams.changes_since(last.record[4]))
         return tokens
 
     def __getitem__(self, token: str) -> Any:
@@ -565,19 +591,20 @@ def stop_at(
         if before.failure is not None:
             runner.adopt(before)
             return before
-        tokens, durations_ns = before.tokens.branch(), [*before.times[2]]
+        tokens, durations_ns = before.tokens.branch(), dict(before.report.ran_ns)
     else:
         values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
-        tokens = TokenManager(program, values, bytearray(b"\1") * len(program.steps), has_payload)
-        durations_ns = [-1] * len(program.steps)
+        tokens = TokenManager.from_scratch(program, values, has_payload)
+        durations_ns = {}
     wanted = bytes(len(program.steps))
     if function is None or why is None:
-        run = Run(tokens, hparams, (program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1))
+        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        run = Run((tokens.values, bytes(tokens.dirty), tokens.has_payload, tokens.revisions, hparams, times, None))
     else:
         tokens.running = next(step.place for step in program.steps if step.name == function)
         run = runner._failed_run(tokens, hparams, wanted, durations_ns, start_ns, why)
     try:
-        return runner._end(run)
+        return runner._end(run, None)
     except BaseException as raised:
         if raised is not why:
             raise

@@ -60,24 +60,29 @@ class TokenManager:
     __slots__ = ("_new", "_stale", "dirty", "has_payload", "origin", "program", "revisions", "running", "values")
 
     def __init__(
-        self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, origin: bytes | None = None
+        self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
     ) -> None:
         self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
+        self.revisions = revisions
         self.running = -1
-        self.revisions = program.revisions() if program.revised else ()
-        self.origin = origin
+        self.origin: bytes | None = None
         # Slots with new values.
         self._new: set[int] = set()
         self._stale: set[int] | None = None
+
+    @classmethod
+    def from_scratch(cls, program: Program, values: list[Any], has_payload: bool) -> TokenManager:
+        """Return tokens of which only source tokens have values."""
+        return cls(program, values, bytearray(b"\1") * len(program.steps), has_payload, program.revisions())
 
     # -- while functions run ------------------------------------------------------------------------------------
 
     def branch(self) -> TokenManager:
         """Return tokens with the same values, for a run that goes on from these."""
-        branch = TokenManager(self.program, self.values.copy(), self.dirty.copy(), self.has_payload, b"")
-        if branch.revisions != self.revisions:
-            for place, before, now in zip(self.program.revised, self.revisions, branch.revisions, strict=True):
-                branch.dirty[place] |= before != now
+        program = self.program
+        branch = TokenManager(program, self.values.copy(), self.dirty.copy(), self.has_payload, program.revisions())
+        for place, before, now in zip(program.revised, self.revisions, branch.revisions, strict=True):
+            branch.dirty[place] |= before != now
         branch.origin = bytes(branch.dirty)
         return branch
 

@@ -23,12 +23,14 @@ from epypes.wording import counted
 if TYPE_CHECKING:
     import pandas as pd
 
-# The program, the steps that were wanted, nanoseconds by step (-1 for those that did not run), nanoseconds in all,
-# whether side by side, the step that failed (-1 if none did). A RunReport is made of them when it is read.
-Times = tuple[Program, bytes | None, Sequence[int], int, bool, int]
+# The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side, the
+# step that failed (-1 if none did). A RunReport is made of them when it is read. Durations of large graphs are packed:
+# one for every step, -1 for those that did not run.
+Durations = dict[int, int] | Sequence[int]
+Times = tuple[Program, bytes | None, Durations, int, bool, int]
 
 KEPT: Final = 1_000
-# Times of larger graphs are packed: a thousand reports would hold a gigabyte of integers.
+# Packed above that: a thousand reports would hold a gigabyte of integers.
 _MAX_UNPACKED: Final = 400
 _COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed")
 _SUMMARY_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
@@ -37,13 +39,13 @@ _STANDARD: Final = NormalDist()
 _FEWEST_WITH_RANGE: Final = 5
 
 
-def longest_path_ns(program: Program, durations_ns: Sequence[int]) -> int:
+def longest_path_ns(program: Program, durations_ns: Mapping[int, int]) -> int:
     """Return how long those functions take that need each other's outputs one after another, at most."""
-    ends_ns = [0] * (len(durations_ns) + 1)  # the last one stands for source tokens
-    for step, duration_ns in zip(program.steps, durations_ns, strict=True):
-        if duration_ns >= 0:
-            ends_ns[step.place] = duration_ns + max((ends_ns[program.makers[slot]] for slot in step.inputs), default=0)
-    return max(ends_ns)
+    ends_ns: dict[int, int] = {}
+    for place in sorted(durations_ns):
+        makers = [program.makers[slot] for slot in program.steps[place].inputs]
+        ends_ns[place] = durations_ns[place] + max((ends_ns.get(maker, 0) for maker in makers), default=0)
+    return max(ends_ns.values(), default=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,21 +77,26 @@ class RunReport:
         From the start of the run to its end, in nanoseconds.
     side_by_side
         Whether functions may have run side by side.
+    ran_ns
+        Nanoseconds by step that ran.
     """
 
-    __slots__ = ("_durations_ns", "_failed_at", "_program", "_wanted", "side_by_side", "total_ns")
+    __slots__ = ("_failed_at", "_program", "_wanted", "ran_ns", "side_by_side", "total_ns")
 
     def __init__(
         self,
         program: Program,
         wanted: bytes | None,
-        durations_ns: Sequence[int],
+        durations_ns: Durations,
         total_ns: int,
         side_by_side: bool = False,
         failed_at: int = -1,
     ) -> None:
         self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
-        self._durations_ns, self._failed_at = durations_ns, failed_at
+        self._failed_at = failed_at
+        if not isinstance(durations_ns, dict):
+            durations_ns = {place: duration for place, duration in enumerate(durations_ns) if duration >= 0}
+        self.ran_ns = durations_ns
 
     @property
     def program(self) -> Program:
@@ -99,18 +106,17 @@ class RunReport:
     @property
     def functions(self) -> tuple[FunctionTime, ...]:
         """One entry per function that the run needed, in run order; of a failed run those it came to."""
-        wanted, failed_at = self._wanted, self._failed_at
+        ran_ns, wanted, failed_at = self.ran_ns, self._wanted, self._failed_at
         return tuple(
-            FunctionTime(step.name, max(duration, 0), duration >= 0, step.place == failed_at)
-            for step, duration in zip(self._program.steps, self._durations_ns, strict=True)
-            if wanted is None or wanted[step.place] or duration >= 0
+            FunctionTime(step.name, ran_ns.get(step.place, 0), step.place in ran_ns, step.place == failed_at)
+            for step in self._program.steps
+            if wanted is None or wanted[step.place] or step.place in ran_ns
         )
 
     @property
     def durations_ns(self) -> dict[str, int]:
         """Nanoseconds by function that ran, in run order; of one that failed until it raised."""
-        steps = zip(self._program.steps, self._durations_ns, strict=True)
-        return {step.name: duration for step, duration in steps if duration >= 0}
+        return {self._program.steps[place].name: self.ran_ns[place] for place in sorted(self.ran_ns)}
 
     @property
     def ran(self) -> tuple[str, ...]:
@@ -120,7 +126,7 @@ class RunReport:
     @property
     def is_whole(self) -> bool:
         """Whether every function of the graph ran, and none failed."""
-        return self._failed_at < 0 and min(self._durations_ns, default=0) >= 0
+        return self._failed_at < 0 and len(self.ran_ns) == len(self._program.steps)
 
     @property
     def failed(self) -> str | None:
@@ -135,7 +141,7 @@ class RunReport:
     @property
     def critical_path_ns(self) -> int:
         """The longest time that functions which need each other's outputs took one after another, in nanoseconds."""
-        return longest_path_ns(self._program, self._durations_ns)
+        return longest_path_ns(self._program, self.ran_ns)
 
     @property
     def overhead_ns(self) -> int:
@@ -146,7 +152,7 @@ class RunReport:
         """
         if self.side_by_side:
             return self.total_ns - self.critical_path_ns
-        return self.total_ns - sum(duration for duration in self._durations_ns if duration > 0)
+        return self.total_ns - sum(self.ran_ns.values())
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table: function, ran, time_ms, share (of the total), failed.
@@ -190,8 +196,10 @@ class Reports(Sequence[RunReport]):
 
     def add(self, times: Times) -> None:
         """Keep the times of one more run."""
-        if len(times[2]) > _MAX_UNPACKED:
-            times = (*times[:2], array("q", times[2]), *times[3:])
+        durations_ns = times[2]
+        if len(durations_ns) > _MAX_UNPACKED and isinstance(durations_ns, dict):
+            packed = array("q", [durations_ns.get(step.place, -1) for step in times[0].steps])
+            times = (*times[:2], packed, *times[3:])
         self.kept.append(times)
 
     @overload

@@ -277,7 +277,7 @@ def test_reprs_stay_short_when_a_redefined_function_fails_and_the_names_are_long
 def report_of(count: int, side_by_side: bool = False) -> ep.RunReport:
     io = {f"f{index}": ((), f"t{index}") for index in range(count)}
     program = Program(ep.CompGraph(dict.fromkeys(io, lambda: 1), io), True)
-    times = [-1, *(1_000_000 + index for index in range(1, count))]
+    times = {index: 1_000_000 + index for index in range(1, count)}
     return ep.RunReport(program, None, times, 2_000_000_000, side_by_side)
 
 
@@ -294,7 +294,8 @@ def test_overhead_of_functions_side_by_side_is_labelled_for_what_it_is():
     assert table_of(report_of(4, side_by_side=True)._repr_mimebundle_()["text/html"])[-1][0] == label
     run = branching_runner().run(image=1)
     assert label not in view(run).caption
-    run = ep.Run(run.tokens, run.hparams, (*run.times[:4], True, -1))
+    *record, times, failure = run.record
+    run = ep.Run((*record, (*times[:4], True, -1), failure))
     assert label in view(run).caption
     assert label in unescape(mimebundle(run)["text/html"])
 

@@ -30,7 +30,7 @@ def report(
     io = {name: ((), f"t{place}") for place, name in enumerate(times_ms)}
     program = Program(ep.CompGraph(dict.fromkeys(io, lambda: 1), io), True)
     names = [step.name for step in program.steps]
-    spent = [-1 if times_ms[name] is None else round(times_ms[name] * MS) for name in names]
+    spent = {names.index(name): round(time * MS) for name, time in times_ms.items() if time is not None}
     failed_at = names.index(failed) if failed else -1
     return ep.RunReport(program, None, spent, round(total_ms * MS), side_by_side, failed_at)
 

@@ -19,7 +19,7 @@ CHAIN = ep.CompGraph(
 def report_of(durations_ns, total_ns=10_000, cg=CHAIN, side_by_side=False, failed=None):
     """A report with these times by function, of a run in which a function may have failed."""
     places = {name: place for place, name in enumerate(cg.functions)}
-    by_step = [durations_ns.get(name, -1) for name in places]
+    by_step = {places[name]: duration for name, duration in durations_ns.items()}
     return ep.RunReport(Program(cg, True), None, by_step, total_ns, side_by_side, places.get(failed, -1))
 
 
