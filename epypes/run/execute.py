@@ -314,8 +314,9 @@ class _Source:
 
     It is made of slot and step numbers only: names and values of the user never enter it. ``v[3]`` is the value in slot
     3, ``d[2]`` the duration of step 2, ``D[2]`` whether it is dirty, ``f2`` its function; ``c3`` whether slot 3 has got
-    a new value. Calls into EPypes are written out for values of the types that the last run had, since each costs some
-    microseconds after a function that has filled the caches with an image; any other value takes the general way.
+    a new value, ``h3`` whether that is a long tuple without arrays. Calls into EPypes are written out for values of the
+    types that the last run had, since each costs some microseconds after a function that has filled the caches with an
+    image; any other value takes the general way.
 
     Parameters
     ----------
@@ -349,8 +350,10 @@ class _Source:
             else sorted(program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), ()))
         )
         self._steps = [program.steps[place] for place in stale if wanted is None or wanted[place]]
-        # Slots of which the source knows whether they are new.
+        # Slots of which the source knows whether they are new, and those of which it knows whether their values, made
+        # in this run, are long tuples without arrays.
         self._known: set[int] = set()
+        self._made: set[int] = set()
 
     def compile(self) -> CompiledRun:
         """Return the function that runs the steps."""
@@ -361,6 +364,7 @@ class _Source:
             *(f"        D[{place}] = 1" for place in self._marked),
             "        start = 0",
             "        try:",
+            *(f"            {line}" for line in self._lend_sources()),
             *(f"            {line}" for step in self._steps for line in self._step(step)),
             "            pass",
             "        except BaseException:",
@@ -373,9 +377,29 @@ class _Source:
         run: CompiledRun = names["make"](self._program, self._program.steps, *_NAMES.values(), self._array)
         return run
 
+    def _lend_sources(self) -> Iterator[str]:
+        """Lend the arrays of source tokens one after another, while the code that does it is in the caches."""
+        for step in self._steps:
+            slots = [slot for slot in step.inputs if self._is_lent_first(step, slot)]
+            if slots:
+                yield f"t.running = {step.place}"
+            for slot in dict.fromkeys(slots):
+                yield f"s{step.place}_{slot} = v[{slot}]"
+                yield from self._lend(step, f"s{step.place}_{slot}", slot)
+
+    def _is_lent_first(self, step: Step, slot: int) -> bool:
+        is_array = self._program.makers[slot] < 0 and slot not in self._plain and self._kind(slot) is self._array
+        return is_array and self._is_written_out(step) and self._program.guard and bool(self._certain[step.place])
+
+    def _is_written_out(self, step: Step) -> bool:
+        program = self._program
+        return step.is_plain or not (
+            program.guard or step.contracts or program.check_mutation or step.switch is not None
+        )
+
     def _step(self, step: Step) -> Iterator[str]:
         checked = [] if self._is_first else [slot for slot in step.outputs if self._program.consumers[slot]]
-        lines = [f"t.running = {step.place}", "start = 0", *self._call(step)]
+        lines = [f"t.running = {step.place}", *self._call(step)]
         for place, slot in enumerate(step.outputs):
             if slot in checked:
                 lines += [
@@ -390,6 +414,7 @@ class _Source:
             lines.append(f"D[{step.place}] = 0")
         if not self._certain[step.place]:
             yield from (f"c{slot} = False" for slot in checked)
+            yield from (f"h{slot} = False" for slot in step.outputs if slot in self._made)
             yield f"if D[{step.place}]:"
             lines = [f"    {line}" for line in lines]
         yield from lines
@@ -405,14 +430,17 @@ class _Source:
     def _call(self, step: Step) -> Iterator[str]:
         """Write out the call of a step, whose values are then ``m0``, ``m1`` and so on."""
         program, made = self._program, [f"m{place}" for place in range(len(step.outputs))]
-        if not step.is_plain and (program.guard or step.contracts or program.check_mutation or step.switch is not None):
+        if not self._is_written_out(step):
+            yield "start = 0"
             yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(program, steps[{step.place}], v, d)"
             return
         args = [f"v[{slot}]" for slot in step.inputs]
         for place, slot in enumerate(step.inputs):
-            if program.guard and slot not in self._plain:
+            if self._is_lent_first(step, slot) and step.inputs.index(slot) == place:
+                args[place] = f"s{step.place}_{slot}"
+            elif program.guard and slot not in self._plain:
                 args[place] = name = f"a{place}"
-                yield f"{name} = v[{slot}]"
+                yield f"start = 0; {name} = v[{slot}]"
                 yield from self._lend(step, name, slot)
         yield "start = clock()"
         yield f"{'m0' if step.single else 'made'} = f{step.place}({', '.join(args)})"
@@ -425,7 +453,8 @@ class _Source:
             if program.guard:
                 for name, slot in zip(made, step.outputs, strict=True):
                     yield from (f"    {line}" for line in self._keep(name, slot))
-            yield f"else: {names} = unpack(program, steps[{step.place}], made, v)"
+            unknown = "".join(f"h{slot} = " for slot in step.outputs if slot in self._made)
+            yield f"else: {unknown and unknown + 'False; '}{names} = unpack(program, steps[{step.place}], made, v)"
         elif program.guard and step.outputs:
             yield from self._keep("m0", step.outputs[0])
 
@@ -446,6 +475,8 @@ class _Source:
             yield f"    {name} = {name}.view()"
             yield f"    {name}.setflags(False)"
             yield f"else: {name} = lend({name})"
+        elif kind is tuple and slot in self._made:
+            yield f"if not h{slot}: {name} = lend({name})"
         elif kind is tuple:
             yield f"if not ({_is_harmless(name, kind)}): {name} = lend({name})"
         elif kind is list:
@@ -463,7 +494,9 @@ class _Source:
             yield f"    {name}.setflags(False)" if self._program.consumers[slot] else "    pass"
             yield f"else: {general}"
         elif kind is tuple:
-            yield f"if not ({_is_harmless(name, kind)}): {general}"
+            yield f"h{slot} = {_is_harmless(name, kind)}"
+            yield f"if not h{slot}: {general}"
+            self._made.add(slot)
         elif kind is list:
             yield f"if not ({_is_harmless(name, kind)} and count({name}) <= FRESH_HERE): {general}"
         else:
