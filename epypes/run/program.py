@@ -170,7 +170,8 @@ class Program:
 
     def note_calls(self, durations_ns: Mapping[int, int]) -> None:
         """Take note of the calls of nodes in a run that has ended."""
-        self.uncounted.append(durations_ns)
+        if self.nodes:
+            self.uncounted.append(durations_ns)
         if len(self.uncounted) > _MAX_UNCOUNTED:
             self.count_calls()
 
