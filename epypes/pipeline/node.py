@@ -46,7 +46,7 @@ class Node:
         self.name = name
         self.func = called_for(name, func)
         # Nanoseconds of the last call, and how many there were.
-        self._called = (0, 0)
+        self._called = [0, 0]
         # Whole in every thread, which counting up is not.
         self._next_count = itertools.count(1).__next__
         # Those that call ``func`` in the node's place; they know of calls that are not counted yet.
@@ -69,7 +69,7 @@ class Node:
 
     def count_call(self, duration_ns: int) -> None:
         """Take note of a call."""
-        self._called = duration_ns, self._next_count()
+        self._called = [duration_ns, self._next_count()]
 
     @property
     def duration_ns(self) -> int:

@@ -297,16 +297,14 @@ _NAMES: Final = {
     "count": getrefcount,
     "ARRAYLESS": ARRAYLESS,
     "HARMLESS": HARMLESS,
-    "LONG": LONG,
     "FRESH": FRESH,
-    "FRESH_HERE": FRESH_HERE,
-    "FRESH_OWNER": FRESH_OWNER,
     "lend": lend,
     "keep": keep,
     "call": call,
     "unpack": unpack,
     "is_unchanged": is_unchanged,
 }
+_FREQUENT: Final = ("clock", "kind", "count", "array", "HARMLESS")
 
 
 class _Source:
@@ -360,7 +358,8 @@ class _Source:
         lines = [
             f"def make(program, steps, {', '.join(_NAMES)}, array):",
             *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
-            "    def run(t, v, D, d):",
+            # As arguments they stand side by side in the frame: each variable of ``make`` is an object of its own.
+            f"    def run(t, v, D, d, {', '.join(f'{name}={name}' for name in _FREQUENT)}):",
             *(f"        D[{place}] = 1" for place in self._marked),
             "        start = 0",
             "        try:",
@@ -447,7 +446,7 @@ class _Source:
         yield f"d[{step.place}] = clock() - start"
         if not step.single and step.outputs:
             names = "".join(f"{name}, " for name in made)
-            yield f"if kind(made) is tuple and len(made) == {len(made)} and count(made) <= FRESH_HERE:"
+            yield f"if kind(made) is tuple and len(made) == {len(made)} and count(made) <= {FRESH_HERE}:"
             yield f"    {names} = made"
             yield "    made = None"  # so that it does not count as one that knows the items
             if program.guard:
@@ -488,9 +487,9 @@ class _Source:
         """Write out ``keep``; an array that no function reads need not be locked."""
         kind, general = self._kind(slot), f"{name} = keep({name}, FRESH, program, {slot}, v)"
         if kind is self._array:
-            owner = "kind(b) is array and b.base is None and count(b) <= FRESH_OWNER"
+            owner = f"kind(b) is array and b.base is None and count(b) <= {FRESH_OWNER}"
             base = f"(b := {name}.base) is None or {owner}"
-            yield f"if kind({name}) is array and count({name}) <= FRESH_HERE and ({base}):"
+            yield f"if kind({name}) is array and count({name}) <= {FRESH_HERE} and ({base}):"
             yield f"    {name}.setflags(False)" if self._program.consumers[slot] else "    pass"
             yield f"else: {general}"
         elif kind is tuple:
@@ -498,14 +497,14 @@ class _Source:
             yield f"if not h{slot}: {general}"
             self._made.add(slot)
         elif kind is list:
-            yield f"if not ({_is_harmless(name, kind)} and count({name}) <= FRESH_HERE): {general}"
+            yield f"if not ({_is_harmless(name, kind)} and count({name}) <= {FRESH_HERE}): {general}"
         else:
             yield f"if kind({name}) not in ARRAYLESS: {general}"
 
 
 def _is_harmless(name: str, kind: type) -> str:
     """Write out whether a value is a long tuple or list without arrays, as its first item tells."""
-    return f"kind({name}) is {kind.__name__} and len({name}) >= LONG and kind({name}[0]) in HARMLESS"
+    return f"kind({name}) is {kind.__name__} and len({name}) >= {LONG} and kind({name}[0]) in HARMLESS"
 
 
 def only_reads_arrays(function: object) -> bool:

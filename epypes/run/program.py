@@ -24,7 +24,7 @@ REVISION: Final = "__epypes_revision__"
 # What a function has that measures its calls: where it is true, a program calls its ``func`` in its place, and has it
 # count the call when the run has ended.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
-_MAX_UNCOUNTED: Final = 100
+MAX_UNCOUNTED: Final = 100
 # More objects than any function refers to on purpose.
 _MOST_REACHED: Final = 1_000
 
@@ -89,7 +89,7 @@ class Program:
     clean
         The dirty flags of a run in which every step is up to date.
     uncounted
-        Of runs that have ended, nanoseconds by step, for nodes to count; if there are nodes.
+        Of runs that have ended, nanoseconds by step, for nodes to count; None if there are no nodes.
     running
         What runs at this moment, in any thread: objects whose ``running`` is a step, or -1.
     selectors
@@ -104,7 +104,7 @@ class Program:
         self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
         self.steps = steps = tuple(_steps(cg, slots, guard and not check_mutation))
         self.nodes = tuple((step.place, step.node) for step in steps if step.node is not None)
-        self.uncounted: deque[Mapping[int, int]] = deque()
+        self.uncounted: deque[Mapping[int, int]] | None = deque() if self.nodes else None
         for _, node in self.nodes:
             node.programs.append(ref(self, node.programs.remove))
         self.running: set[Any] = set()
@@ -170,15 +170,14 @@ class Program:
 
     def note_calls(self, durations_ns: Mapping[int, int]) -> None:
         """Take note of the calls of nodes in a run that has ended."""
-        if self.nodes:
+        if self.uncounted is not None:
             self.uncounted.append(durations_ns)
-        if len(self.uncounted) > _MAX_UNCOUNTED:
             self.count_calls()
 
     def count_calls(self) -> None:
         """Have the nodes count the calls of the runs that have ended; done when a node is asked for them."""
         with contextlib.suppress(IndexError):
-            while True:
+            while self.uncounted:
                 durations_ns = self.uncounted.popleft()
                 for place, node in self.nodes:
                     if place in durations_ns:

@@ -18,7 +18,7 @@ from epypes.run.failure import failure_of
 from epypes.run.guard import COPIERS, lend, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
-from epypes.run.program import Program
+from epypes.run.program import MAX_UNCOUNTED, Program
 from epypes.run.result import Run, TrialOf, new_run
 from epypes.run.staleness import TokenManager
 from epypes.run.timing import Reports
@@ -280,8 +280,10 @@ class CompGraphRunner:
         # Without targets everything is up to date then.
         left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
         run.record = values, left_dirty, True, revisions, hparams, times, None
-        if program.nodes:
-            program.note_calls(durations_ns)
+        if (uncounted := program.uncounted) is not None:
+            uncounted.append(durations_ns)
+            if len(uncounted) > MAX_UNCOUNTED:
+                program.count_calls()
         if trial_of is not None:
             run.trial_of = trial_of
             return run
