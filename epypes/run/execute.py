@@ -342,12 +342,8 @@ class _Source:
         self._carried = tokens.origin or b""
         self._changed = {program.slots[token] for token in changed}
         self._marked = sorted({place for slot in self._changed for place in program.consumers[slot]})
-        stale = (
-            range(len(program.steps))
-            if tokens.origin is None
-            else sorted(program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), ()))
-        )
-        self._steps = [program.steps[place] for place in stale if wanted is None or wanted[place]]
+        stale = program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), ())
+        self._steps = [program.steps[place] for place in sorted(stale) if wanted is None or wanted[place]]
         # Slots of which the source knows whether they are new, and those of which it knows whether their values, made
         # in this run, are long tuples without arrays.
         self._known: set[int] = set()
