@@ -176,7 +176,9 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
         It does not keep to its contract, changed an object inside an input, or returned what can be read only once.
     """
     # Unpacked at once: to look up one field of a named tuple takes as long.
-    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, _ = step
+    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node = step
+    if node is not None:
+        function = node.func
     start_ns = 0
     try:
         if is_plain:
@@ -187,7 +189,7 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
         else:
             args = _args(program, step, values)
             if program.check_mutation and switch is None:
-                function = partial(_call_checked, program, step, values)
+                function = partial(_call_checked, program, step, function, values)
         start_ns = perf_counter_ns()
         result = function(*args)
         durations_ns[place] = perf_counter_ns() - start_ns
@@ -216,7 +218,7 @@ def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
     return args
 
 
-def _call_checked(program: Program, step: Step, values: Sequence[Any], *args: Any) -> Any:
+def _call_checked(program: Program, step: Step, function: Callable[..., Any], values: Sequence[Any], *args: Any) -> Any:
     """Call a step's function; put back what it has changed of its inputs, and raise InputMutated."""
     given = {program.tokens[slot]: values[slot] for slot in step.inputs}
     if step.unguarded:  # which can write into memory that is locked for others
@@ -224,7 +226,7 @@ def _call_checked(program: Program, step: Step, values: Sequence[Any], *args: An
         given.update((program.tokens[slot], view) for slot, view in views if is_array(view))
     before = Snapshot(given)
     try:
-        result = step.function(*args)
+        result = function(*args)
     except BaseException:
         before.restore()
         raise
@@ -438,7 +440,8 @@ class _Source:
                 yield f"start = 0; {name} = v[{slot}]"
                 yield from self._lend(step, name, slot)
         yield "start = clock()"
-        yield f"{'m0' if step.single else 'made'} = f{step.place}({', '.join(args)})"
+        function = f"f{step.place}" if step.node is None else f"f{step.place}.func"
+        yield f"{'m0' if step.single else 'made'} = {function}({', '.join(args)})"
         yield f"d[{step.place}] = clock() - start"
         if not step.single and step.outputs:
             names = "".join(f"{name}, " for name in made)
@@ -461,7 +464,11 @@ class _Source:
         maker = self._program.makers[slot]
         is_locked = maker >= 0 and self._program.steps[maker].switch is None
         kind = self._kind(slot)
-        if kind is self._array and is_locked and only_reads_arrays(step.function):
+        if (
+            kind is self._array
+            and is_locked
+            and only_reads_arrays(step.function if step.node is None else step.node.func)
+        ):
             yield f"if kind({name}) is not array: {name} = lend({name})"
         elif kind is self._array and is_locked:
             yield f"{name} = {name}.view() if kind({name}) is array else lend({name})"

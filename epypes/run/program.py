@@ -49,7 +49,7 @@ class Step(NamedTuple):
     is_plain
         Whether its inputs are lent and nothing more is to be done about them.
     node
-        What measures the calls of the function and is called in its place elsewhere, if there is one.
+        The function, if it is a node whose ``func`` may be called in its place.
     """
 
     place: int
@@ -259,7 +259,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
         yield _new_step((
             place,
             name,
-            function.func if has_node else function,
+            function,
             (slots[inputs[0]],) if len(inputs) == 1 else tuple(map(slot_of, inputs)),
             (slots[outputs[0]],) if len(outputs) == 1 else tuple(map(slot_of, outputs)),
             type(io[1]) is str,

@@ -205,19 +205,18 @@ class CompGraphRunner:
         if targets:
             self._require_targets(targets)
         program = self._program
-        self._lock.acquire()
-        try:
+        with self._lock:
             first, last = self._hparams, self.last
             hparams = first.frozen(changes, also_new=False)
             if not is_trial:
                 self._hparams = hparams
-        finally:
-            self._lock.release()
         if last is None:
             free = self.free_source_tokens
             raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first.")
         trial_of = (self._key, first, ref(last)) if is_trial else None
-        values, dirty, has_payload, _, before, _, _ = last.record
+        values, dirty, has_payload, _, before, _, failure = last.record
+        # A failure keeps this frame, with all that is named in it: the run before, which may have failed too.
+        del failure
         if hparams.follows == before.revision and has_payload and not program.revised:
             # A slider goes this way: as short as can be.
             changed, wanted = hparams.changed, self._wanted.get(targets) if targets else None
@@ -226,7 +225,6 @@ class CompGraphRunner:
                 values = values.copy()
                 for token, value in changed.items():
                     values[program.slots[token]] = value
-                # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too.
                 del last
                 return self._repeat(compiled, values, dirty, wanted, hparams, start_ns, trial_of)
         tokens = last.tokens.branch()
@@ -287,11 +285,8 @@ class CompGraphRunner:
         if trial_of is not None:
             run.trial_of = trial_of
             return run
-        self._lock.acquire()  # half the time of a with statement
-        try:
+        with self._lock:
             self.last = run
-        finally:
-            self._lock.release()
         self._keep_times(times)
         if self._watchers:
             self._tell_watchers()
