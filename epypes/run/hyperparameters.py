@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,8 +14,6 @@ from epypes.run.staleness import NOT_COMPUTED, is_same_value
 
 if TYPE_CHECKING:
     from epypes.run.execute import CompiledRun
-
-_NOTHING: Final[Mapping[str, Any]] = {}
 
 
 class Hyperparameters:
@@ -45,15 +44,13 @@ class Hyperparameters:
         program: Program,
         entries: dict[str, tuple[Any, Any]],
         revision: int = 0,
-        changed: Mapping[str, Any] = _NOTHING,
-        follows: int = -1,
         plain: frozenset[str] = frozenset(),
     ) -> None:
         self.program = program
         self.entries = entries
         self.revision = revision
-        self.changed = changed
-        self.follows = follows
+        self.changed: Mapping[str, Any] = {}
+        self.follows = -1
         self.plain = plain
         self.repeated: tuple[CompiledRun, list[Any], dict[str, int]] | None = None
         self._base: list[Any] | None = None
@@ -126,13 +123,19 @@ class Hyperparameters:
                 value = keep(value, 0, program, program.slots[token], ()) if program.guard else value
             new[token] = value
             entries[token] = (value, value if entry is None else entry[1])
-        return Hyperparameters(program, entries, revision + 1, new, follows, plain) if new else self
+        if not new:
+            return self
+        made = _new_hyperparameters()  # a slider makes some at each move: half the time of Hyperparameters(...)
+        made.program, made.entries, made.revision = program, entries, revision + 1
+        made.changed, made.follows, made.plain = new, follows, plain
+        made.repeated = made._base = made._free_slots = None
+        return made
 
     def unfrozen(self, token: str) -> Hyperparameters:
         """Return these without a token, which becomes a free source token."""
         self.require(token)
         entries = {name: entry for name, entry in self.entries.items() if name != token}
-        return Hyperparameters(self.program, entries, self.revision + 1, plain=self.plain - {token})
+        return Hyperparameters(self.program, entries, self.revision + 1, self.plain - {token})
 
     def with_payload(self, payload: Mapping[str, Any]) -> list[Any]:
         """Return the values by slot with which a run on a payload begins.
@@ -201,3 +204,6 @@ class Hyperparameters:
         else:
             text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
         return PayloadError((token,), text)
+
+
+_new_hyperparameters: Final[Callable[[], Hyperparameters]] = partial(object.__new__, Hyperparameters)
