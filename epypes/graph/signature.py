@@ -1,19 +1,17 @@
-"""What does a function's signature say about its inputs?
-
-A graph of 10,000 functions is checked in milliseconds, so what a plain function says is read from its code;
-``inspect.signature`` costs twenty times as much and is asked only where the code is not the whole truth.
-"""
+"""The signature of a function: the inputs that it takes, and the output tokens that ``@ep.outputs`` names."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import FunctionType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
-_POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+F = TypeVar("F", bound=Callable[..., Any])
+
 NO_DEFAULT: Final = inspect.Parameter.empty
+_OUTPUTS: Final = "__epypes_outputs__"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,46 +51,78 @@ def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
         return None
 
 
-def is_plain(function: object) -> bool:
-    """Whether this is a Python function or lambda whose code says all: no wrapper, no signature of its own."""
-    return type(function) is FunctionType and not (function.__dict__ and _speaks_for_another(function))
-
-
-def _speaks_for_another(function: FunctionType) -> bool:
-    return "__wrapped__" in function.__dict__ or "__signature__" in function.__dict__
-
-
 def parameters_of(function: Callable[..., Any]) -> Parameters | None:
     """Return what a function takes, or None where that is not known."""
-    if isinstance(function, FunctionType) and is_plain(function):
-        return _from_code(function)
     signature = signature_of(function)
-    return None if signature is None else _from_signature(signature)
-
-
-def _from_code(function: FunctionType) -> Parameters:
-    code = function.__code__
-    count = code.co_argcount
-    names = code.co_varnames[:count]
-    defaults = function.__defaults__ or ()
-    filled = (*(NO_DEFAULT,) * (count - len(defaults)), *defaults)
-    given = function.__kwdefaults__ or {}
-    by_keyword = code.co_varnames[count : count + code.co_kwonlyargcount]
-    return Parameters(
-        tuple(zip(names, filled, strict=True)),
-        bool(code.co_flags & inspect.CO_VARARGS),
-        tuple(name for name in by_keyword if name not in given),
-    )
-
-
-def _from_signature(signature: inspect.Signature) -> Parameters:
+    if signature is None:
+        return None
     parameters = signature.parameters.values()
     return Parameters(
-        tuple((parameter.name, parameter.default) for parameter in parameters if parameter.kind in _POSITIONAL),
-        any(parameter.kind is inspect.Parameter.VAR_POSITIONAL for parameter in parameters),
+        tuple(
+            (parameter.name, parameter.default)
+            for parameter in parameters
+            if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+        ),
+        any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters),
         tuple(
             parameter.name
             for parameter in parameters
-            if parameter.kind is inspect.Parameter.KEYWORD_ONLY and parameter.default is NO_DEFAULT
+            if parameter.kind is parameter.KEYWORD_ONLY and parameter.default is NO_DEFAULT
         ),
     )
+
+
+def distinct(functions: Mapping[str, Any]) -> dict[int, Any]:
+    """Return each function once, by its id: a large graph has few functions under many names."""
+    return {id(function): function for function in functions.values()}
+
+
+def takes_exactly(function: object, count: int) -> bool:
+    """Whether this is a plain function of that many parameters, as its code says: the usual case.
+
+    ``inspect.signature`` takes 10 us, and a graph may have 10,000 functions.
+    """
+    return (
+        type(function) is FunctionType
+        and function.__code__.co_argcount == count
+        and not function.__code__.co_kwonlyargcount
+        and not {"__wrapped__", "__signature__"} & function.__dict__.keys()
+    )
+
+
+def outputs(*names: str) -> Callable[[F], F]:
+    """Name the output tokens of a function, for ``CompGraph.from_functions``.
+
+    One name takes the value as it is, n names a sequence of n values; without a name there is no output.
+
+    Examples
+    --------
+    >>> @outputs("keypoints", "descriptors")
+    ... def detect(image):
+    ...     return [], None
+    """
+    for name in names:
+        if not isinstance(name, str) or not name:
+            text = f"outputs() takes the names of tokens, not {name!r}."
+            raise TypeError(text + ' Write @ep.outputs("a", "b") above the function.' * callable(name))
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"outputs() names {', '.join(map(repr, twice))} twice. Every output is a token of its own.")
+
+    def mark(function: F) -> F:
+        try:
+            setattr(function, _OUTPUTS, names)
+        except (AttributeError, TypeError) as error:
+            name = getattr(function, "__name__", function)
+            raise TypeError(
+                f"{name!r} can't be marked. Write a function (def) that calls it, and mark that."
+            ) from error
+        return function
+
+    return mark
+
+
+def declared_outputs(function: object) -> tuple[str, ...] | None:
+    """Return the names given to ``outputs``, None if it was not used."""
+    found = getattr(function, _OUTPUTS, None)
+    return found if isinstance(found, tuple) else None

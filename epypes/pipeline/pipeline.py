@@ -9,8 +9,7 @@ from time import perf_counter_ns
 from typing import Any
 
 from epypes.errors import HyperparameterError, PayloadError
-from epypes.graph import CompGraph
-from epypes.graph.hinted import annotated_params
+from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
 from epypes.pipeline.network import NodeBasedCompGraph
 from epypes.pipeline.node import Node, is_a_call

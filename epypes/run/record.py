@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
-from epypes.graph.redefined import redefined
+from epypes.graph import redefined
 from epypes.run.failure import Failure
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.hyperparameters import Hyperparameters

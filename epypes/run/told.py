@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from epypes.graph.redefined import redefined
+from epypes.graph import redefined
 from epypes.wording import counted
 
 if TYPE_CHECKING:

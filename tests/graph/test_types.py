@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import epypes as ep
 from epypes.errors import GraphError
-from epypes.graph.disjoint import are_disjoint
+from epypes.graph.type_check import are_disjoint
 
 T = TypeVar("T")
 
