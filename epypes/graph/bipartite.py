@@ -50,14 +50,6 @@ class BipartiteDigraph:
         sides = zip(self.inputs.values(), self.outputs.values(), strict=True)
         return dict.fromkeys(itertools.chain.from_iterable(itertools.chain.from_iterable(sides)))
 
-    def in_order(self, order: tuple[str, ...]) -> BipartiteDigraph:
-        """Return the digraph with its functions in another order."""
-        if order == tuple(self.inputs):
-            return self
-        return BipartiteDigraph(
-            {name: self.inputs[name] for name in order}, {name: self.outputs[name] for name in order}
-        )
-
     def successors(self, function: str) -> Iterable[str]:
         """Return the functions that take an output of ``function``, each once, in order of definition."""
         # In a faulty graph a token may have a second producer.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Container, Iterable, Mapping
 from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -10,7 +11,7 @@ from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.identity import is_redefined_inside, redefined
 from epypes.graph.placeholder import is_placeholder
-from epypes.graph.signature import NO_DEFAULT, Parameters, declared_outputs, parameters_of
+from epypes.graph.signature import declared_outputs, positional_of, signature_of
 from epypes.graph.switch import as_switch
 from epypes.graph.token_annotations import read_contracts
 from epypes.graph.validation import Default, GraphParts, find_problems, read_io
@@ -115,14 +116,16 @@ class CompGraph:
         findings += find_problems(parts, digraph, func_io, contracts, len(order) == len(digraph.inputs))
         if findings:
             raise GraphError(findings)
-        self._digraph, self._types = digraph.in_order(order), parts.types
+        inputs, outputs = digraph.inputs, digraph.outputs
+        digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
+        self._digraph, self._types = digraph, parts.types
         self._contracts = MappingProxyType(contracts)
         self._functions = MappingProxyType({name: parts.functions[name] for name in order})
         self._func_io = MappingProxyType({name: func_io[name] for name in order})
-        self._known = self._digraph.tokens()
+        self._known = digraph.tokens()
         self._tokens = tuple(self._known)
-        self._sources = tuple(token for token in self._tokens if token not in self._digraph.producer)
-        self._sinks = tuple(token for token in self._tokens if token not in self._digraph.consumers)
+        self._sources = tuple(token for token in self._tokens if token not in digraph.producer)
+        self._sinks = tuple(token for token in self._tokens if token not in digraph.consumers)
         special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
         self._placeholders = tuple(name for name, function in special if is_placeholder(function))
         self._switches = tuple(name for name, function in special if as_switch(function) is not None)
@@ -262,10 +265,6 @@ class CompGraph:
         """Give what a pickle is made of; functions are pickled by name."""
         return type(self)._of, (self._parts(),)
 
-    def __copy__(self) -> Self:
-        """Return the graph itself, which does not change."""
-        return self
-
     def __deepcopy__(self, memo: object) -> Self:
         """Return the graph itself, which does not change."""
         return self
@@ -287,21 +286,22 @@ def _read_functions(functions: Iterable[Any], types: bool) -> GraphParts:
     """Read names, io and defaults of functions; what can't be read becomes a finding and is left out."""
     parts = GraphParts(types=types)
     for function in functions:
-        read = _name_and_parameters(function, parts.functions)
-        if isinstance(read, Finding):
-            parts.findings.append(read)
+        signature = _declaration(function, parts.functions)
+        if isinstance(signature, Finding):
+            parts.findings.append(signature)
             continue
-        name, parameters = read
+        name, positional = function.__name__, positional_of(signature)
         made = declared_outputs(function)
         outputs: Any = name if made is None else made[0] if len(made) == 1 else made or None
         parts.functions[name] = function
-        parts.func_io[name] = (tuple(token for token, _ in parameters.positional), outputs)
-        given = [(token, value) for token, value in parameters.positional if value is not NO_DEFAULT]
-        parts.defaults.extend(Default(token, value, name) for token, value in given)
+        parts.func_io[name] = (tuple(parameter.name for parameter in positional), outputs)
+        given = [parameter for parameter in positional if parameter.default is not parameter.empty]
+        parts.defaults.extend(Default(parameter.name, parameter.default, name) for parameter in given)
     return parts
 
 
-def _name_and_parameters(function: Any, taken: Container[str]) -> tuple[str, Parameters] | Finding:
+def _declaration(function: Any, taken: Container[str]) -> inspect.Signature | Finding:
+    """Return the signature of a function that has one and a name that is not taken, else what is wrong with it."""
     if not callable(function):
         text = f"{function!r:.60} is {type(function).__name__}, which can't be called. Give functions, one by one."
         return Finding("not callable", text, ())
@@ -314,14 +314,14 @@ def _name_and_parameters(function: Any, taken: Container[str]) -> tuple[str, Par
         return Finding(
             "two functions", f"Two functions are called {name!r}. Rename one of them, or {_BY_HAND}.", (name,)
         )
-    parameters = parameters_of(function)
-    if parameters is None:
+    signature = signature_of(function)
+    if signature is None:
         text = (
             f"The parameters of {name!r} are not known, since it has no signature. "
             f"Write a function (def) that calls it, or {_BY_HAND}."
         )
         return Finding("no signature", text, (name,))
-    return name, parameters
+    return signature
 
 
 def _redefined_text(cg: CompGraph) -> str:

@@ -4,43 +4,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import FunctionType
 from typing import Any, Final, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-NO_DEFAULT: Final = inspect.Parameter.empty
 _OUTPUTS: Final = "__epypes_outputs__"
-
-
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """What a function takes.
-
-    Attributes
-    ----------
-    positional
-        Names and defaults of the parameters that can be given by position; NO_DEFAULT where there is none.
-    variadic
-        Whether it takes any number more (``*args``).
-    required_by_keyword
-        The parameters that can't be given by position and have no default.
-    """
-
-    positional: tuple[tuple[str, Any], ...]
-    variadic: bool
-    required_by_keyword: tuple[str, ...]
-
-    @property
-    def least(self) -> int:
-        """The least number of positional inputs."""
-        return sum(default is NO_DEFAULT for _, default in self.positional)
-
-    @property
-    def most(self) -> float:
-        """The largest number of positional inputs; inf for ``*args``."""
-        return float("inf") if self.variadic else len(self.positional)
 
 
 def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
@@ -51,25 +20,10 @@ def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
         return None
 
 
-def parameters_of(function: Callable[..., Any]) -> Parameters | None:
-    """Return what a function takes, or None where that is not known."""
-    signature = signature_of(function)
-    if signature is None:
-        return None
-    parameters = signature.parameters.values()
-    return Parameters(
-        tuple(
-            (parameter.name, parameter.default)
-            for parameter in parameters
-            if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-        ),
-        any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters),
-        tuple(
-            parameter.name
-            for parameter in parameters
-            if parameter.kind is parameter.KEYWORD_ONLY and parameter.default is NO_DEFAULT
-        ),
-    )
+def positional_of(signature: inspect.Signature) -> list[inspect.Parameter]:
+    """Return the parameters that can be given by position, but for ``*args``."""
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return [parameter for parameter in signature.parameters.values() if parameter.kind in kinds]
 
 
 def distinct(functions: Mapping[str, Any]) -> dict[int, Any]:
@@ -77,17 +31,15 @@ def distinct(functions: Mapping[str, Any]) -> dict[int, Any]:
     return {id(function): function for function in functions.values()}
 
 
-def takes_exactly(function: object, count: int) -> bool:
-    """Whether this is a plain function of that many parameters, as its code says: the usual case.
+def plain_count(function: object) -> int | None:
+    """Return how many parameters a plain function has, all of which can be given by position; None for any other.
 
-    ``inspect.signature`` takes 10 us, and a graph may have 10,000 functions.
+    It is read from the code: ``inspect.signature`` takes 10 us, and a graph may have 10,000 functions.
     """
-    return (
-        type(function) is FunctionType
-        and function.__code__.co_argcount == count
-        and not function.__code__.co_kwonlyargcount
-        and not {"__wrapped__", "__signature__"} & function.__dict__.keys()
-    )
+    if type(function) is not FunctionType or function.__code__.co_kwonlyargcount:
+        return None
+    is_plain = not function.__dict__ or function.__dict__.keys().isdisjoint(("__wrapped__", "__signature__"))
+    return function.__code__.co_argcount if is_plain else None
 
 
 def outputs(*names: str) -> Callable[[F], F]:

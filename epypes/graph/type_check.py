@@ -17,7 +17,7 @@ from epypes.annotations import hints_of
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.identity import innermost
-from epypes.graph.signature import distinct, parameters_of
+from epypes.graph.signature import distinct, positional_of, signature_of
 
 # A finding is a sentence; a long type is cut.
 _WIDEST: Final = 60
@@ -83,9 +83,10 @@ def _hints_by_function(
     for key, function in distinct(functions).items():
         hints = hints_of(function) if _is_annotated(function) else None
         if hints:
-            parameters = parameters_of(function)
-            positional = parameters.positional if parameters is not None else ()
-            read[key] = tuple(hints.get(name, Any) for name, _ in positional), hints.get("return", Any)
+            signature = signature_of(function)
+            positional = positional_of(signature) if signature is not None else ()
+            taken = tuple(hints.get(parameter.name, Any) for parameter in positional)
+            read[key] = taken, hints.get("return", Any)
     named = {name: id(functions.get(name)) for name in digraph.inputs} if read else {}
     return {name: read[key] for name, key in named.items() if key in read}
 
@@ -140,21 +141,19 @@ def _bare(hint: Any) -> Any:
 
 
 def _alternatives(hint: Any) -> Iterator[Any]:
-    """Give the members of a union, those of unions in it included; any other hint alone, without ``Annotated``."""
+    """Give the members of a union, and the types of a literal's values; any other hint alone, without ``Annotated``."""
     plain = _bare(hint)
     if typing.get_origin(plain) in (Union, types.UnionType):
         for member in typing.get_args(plain):
             yield from _alternatives(member)
+    elif typing.get_origin(plain) is Literal:
+        yield from map(type, typing.get_args(plain))
     else:
         yield type(None) if plain is None else plain
 
 
 def _exclude(left: Any, right: Any) -> bool:
-    """Whether surely no value satisfies both of two hints that are no unions."""
-    if typing.get_origin(left) is Literal:
-        return all(_excludes_value(right, value) for value in typing.get_args(left))
-    if typing.get_origin(right) is Literal:
-        return _exclude(right, left)
+    """Whether surely no value satisfies both of two hints that are no unions and no literals."""
     one, other = typing.get_origin(left) or left, typing.get_origin(right) or right
     if not isinstance(one, type) or not isinstance(other, type):
         return False  # a TypeVar, a NewType ...
@@ -166,13 +165,6 @@ def _exclude(left: Any, right: Any) -> bool:
         return not (_is_open(one) or _is_open(other) or _are_exchanged(one, other) or _have_common_class(one, other))
     except Exception:  # a TypedDict, or a metaclass that raises
         return False
-
-
-def _excludes_value(hint: Any, value: Any) -> bool:
-    """Whether a hint surely does not allow a value of a Literal."""
-    if typing.get_origin(hint) is Literal:
-        return not any(type(value) is type(other) and value == other for other in typing.get_args(hint))
-    return _exclude(type(value), hint)
 
 
 def _is_open(kind: type) -> bool:

@@ -6,13 +6,14 @@ import inspect
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from math import inf
 from types import FunctionType
 from typing import Any, Final, NamedTuple
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.identity import is_same_default
-from epypes.graph.signature import Parameters, parameters_of, signature_of, takes_exactly
+from epypes.graph.signature import distinct, plain_count, positional_of, signature_of
 from epypes.graph.switch import as_switch
 from epypes.graph.token_annotations import check_images
 from epypes.graph.type_check import check_types
@@ -79,15 +80,14 @@ def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[Bipart
     for name, io in func_io.items():
         try:
             given, made = io if isinstance(io, tuple | list) else ()
-            inputs[name], outputs[name] = _tokens(given), () if made is None else _tokens(made)
+            taken, returned = _tokens(given), () if made is None else _tokens(made)
         except (TypeError, ValueError):
             text = f"The io of function {name!r} is {io!r}; write {_SHAPES}, with None for no output."
             findings.append(Finding("bad io", text, (str(name),)))
             continue
-        written[name] = (
-            given if isinstance(given, str) else inputs[name],
-            made if made is None or isinstance(made, str) else outputs[name],
-        )
+        inputs[name], outputs[name] = taken, returned
+        is_single = made is None or isinstance(made, str)
+        written[name] = (given if isinstance(given, str) else taken, made if is_single else returned)
     return BipartiteDigraph(inputs, outputs), written
 
 
@@ -172,22 +172,27 @@ def _check_producers(digraph: BipartiteDigraph) -> Iterable[Finding]:
 
 def _check_arity(functions: Mapping[str, Callable[..., Any]], digraph: BipartiteDigraph) -> Iterable[Finding]:
     """Find functions that can't be called with as many inputs as their io names."""
-    known: dict[int, Parameters | None] = {}
+    plain = {key: plain_count(function) for key, function in distinct(functions).items()}
+    signatures: dict[int, inspect.Signature | None] = {}
     for name, tokens in digraph.inputs.items():
         function = functions.get(name)
-        if function is None or not callable(function) or takes_exactly(function, len(tokens)):
+        if plain.get(id(function)) == len(tokens) or not callable(function):
             continue
-        if id(function) not in known:
-            known[id(function)] = parameters_of(function)
-        parameters = known[id(function)]
-        if parameters is None:
+        if id(function) not in signatures:
+            signatures[id(function)] = signature_of(function)
+        signature = signatures[id(function)]
+        if signature is None:
             continue
-        least, most, required = parameters.least, parameters.most, parameters.required_by_keyword
+        parameters = signature.parameters.values()
+        positional = positional_of(signature)
+        least = sum(parameter.default is parameter.empty for parameter in positional)
+        is_variadic = any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters)
+        most = inf if is_variadic else len(positional)
+        required = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY and each.default is each.empty]
         if not least <= len(tokens) <= most:
             takes = counted(least, "input") if least == most else f"{least} to {most:g} inputs"
             text = (
-                f"Function {name!r} takes {takes} {signature_of(function)}, "
-                f"but its io names {len(tokens)}: ({', '.join(tokens)})."
+                f"Function {name!r} takes {takes} {signature}, but its io names {len(tokens)}: ({', '.join(tokens)})."
             )
             yield Finding("arity", text, (name, *tokens))
         elif required:
