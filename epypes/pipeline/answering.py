@@ -17,10 +17,11 @@ FOut = Callable[[EventView], Any]
 
 
 class OfThread(threading.local):
-    """The stamps of the event that a thread works on, and the event whose keeper has been told."""
+    """The stamps of the event that a thread works on, its loop's f_in, and the event that was settled last."""
 
     def __init__(self) -> None:
         self.stamps = Stamps()
+        self.f_in: Any = None
         self.settled: Any = None
 
 

@@ -113,7 +113,14 @@ class SinkPipeline(Pipeline):
         # Where the last event that failed did so, what was raised, and how many had been worked on.
         self._failed_last: tuple[Where | None, str, int] = (None, "", 0)
         self._own = OfThread()
-        self.loop = EventLoop(q_in, self.handle, name=name, busy=self._busy, settle=self._settle_if_not_yet)
+        self.loop = EventLoop(q_in, self)
+
+    def _react(self, event: Any, f_in: FIn | None) -> None:
+        self._own.f_in = f_in
+        try:
+            self.handle(event)
+        finally:
+            self._own.f_in = None
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
@@ -126,7 +133,7 @@ class SinkPipeline(Pipeline):
         self._own.stamps = stamps = Stamps()
         try:
             stamps.f_in_start = stamps.react
-            payload = self.f_in(event)
+            payload = (self._own.f_in or self.f_in)(event)
             stamps.f_in_end = perf_counter_ns()
             if type(payload) is not dict:
                 self._require_mapping(payload)
@@ -148,8 +155,9 @@ class SinkPipeline(Pipeline):
             text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
             raise TypeError(text)
 
+    @property
     def _busy(self) -> tuple[str, ...]:
-        """Return what has not returned: functions of the graph, or f_in, or f_out with its put on q_out."""
+        """What has not returned, for errors: functions of the graph, or f_in, or f_out with its put on q_out."""
         return self.network.running or tuple(where for where in self._under_way() if where != "graph")
 
     def _under_way(self) -> list[Where]:
@@ -195,11 +203,10 @@ class SinkPipeline(Pipeline):
         self._own.settled = event
         settle(event, exception, text)
 
-    def _settle_if_not_yet(self, event: Any, exception: BaseException | None) -> None:
-        """Settle an event of the loop, unless `handle` has: that of a subclass need not call this one's."""
+    def _has_settled(self, event: Any) -> bool:
+        """Whether ``handle`` has settled the event: that of a subclass need not call this one's."""
         settled, self._own.settled = self._own.settled, None
-        if settled is not event:
-            settle(event, exception)
+        return settled is event
 
     def _failure_of(
         self, event: Any, where: Where | None, exception: BaseException, run: Run | None
@@ -301,9 +308,10 @@ class FullPipeline(Answering, SinkPipeline):
         super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
 
+    @property
     def _busy(self) -> tuple[str, ...]:
-        """Return what has not returned, and tell f_out from the put of its answer."""
-        return tuple("put on q_out" if name == "f_out" and self._is_putting() else name for name in super()._busy())
+        """What has not returned, for errors; an f_out that returned is told from the put of its answer."""
+        return tuple("put on q_out" if name == "f_out" and self._is_putting() else name for name in super()._busy)
 
     @property
     def stages(self) -> Stages:

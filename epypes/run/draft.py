@@ -84,7 +84,7 @@ class Draft:
 
     def tokens(self) -> TokenManager:
         """Return the tokens as they are now, for good."""
-        return TokenManager(self.values, self.freshness())
+        return TokenManager.of_run(self.values, self.freshness())
 
 
 def draft_after(program: Program, last: Run | None, hparams: Hyperparameters) -> Draft:

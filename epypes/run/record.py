@@ -72,7 +72,7 @@ class Run(Mapping[str, Any]):
         try:
             return self._tokens
         except AttributeError:
-            self._tokens: TokenManager = TokenManager(self.record[0], self.record[1])
+            self._tokens: TokenManager = TokenManager.of_run(self.record[0], self.record[1])
             return self._tokens
 
     def __getitem__(self, token: str) -> Any:

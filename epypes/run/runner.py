@@ -27,8 +27,11 @@ from epypes.run.watchers import Watchers
 Payload = Mapping[str, Any]
 
 
-class CompGraphRunner:
-    """Runs a graph; reads like a dictionary of its tokens.
+class CompGraphRunner(Mapping[str, Any]):
+    """Runs a graph; a mapping of its tokens that can be read now.
+
+    These are the hyperparameters, and what the last run has left that is not stale, in graph order. Reading any other
+    token raises; ``get`` returns its default. If other threads run it meanwhile, ``dict(runner.last)`` is of one run.
 
     Parameters
     ----------
@@ -393,20 +396,19 @@ class CompGraphRunner:
             raise StaleToken(token)
         return value
 
-    def __contains__(self, token: object) -> bool:
-        return token in self.keys()
-
     def __iter__(self) -> Iterator[str]:
-        return iter(self.keys())
-
-    def __len__(self) -> int:
-        return len(self.keys())
-
-    def keys(self) -> tuple[str, ...]:
-        """Return the tokens that can be read now, in graph order."""
         hparams, last = self._state
         now, frozen = tokens_now(self._program, last, hparams), hparams.entries
-        return tuple(token for token in self.cg.tokens if token in frozen or now.is_readable(token))
+        return iter([token for token in self.cg.tokens if token in frozen or now.is_readable(token)])
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    # Values may be arrays, and a runner changes: runners are told apart by identity.
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     def __repr__(self) -> str:
         return one_line(self)

@@ -6,9 +6,11 @@ The cost does not depend on the size of the values.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StaleToken
+from epypes.graph import CompGraph
 from epypes.run.guard import lend
 from epypes.run.program import Program
 
@@ -60,23 +62,60 @@ class Freshness:
 
 
 class TokenManager:
-    """The token values of one run, which do not change any more.
+    """The values of a graph's tokens, which do not change any more.
 
-    A run works on values of its own, so concurrent runs never see each other's.
+    A runner delegates storage to it: each run works on values of its own, so concurrent runs never see each other's,
+    and leaves them as ``run.tokens``.
+
+    Parameters
+    ----------
+    cg
+        The graph.
+    values
+        By token, the values that are known and up to date; none without.
+
+    Raises
+    ------
+    UnknownName
+        The graph has no such token.
 
     Attributes
     ----------
     values
-        By slot.
+        By slot of the compiled graph.
     freshness
         Which of them are up to date.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Computational graphs".
+
+    Examples
+    --------
+    >>> cg = CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")})
+    >>> tokens = TokenManager(cg, {"x": 1})
+    >>> tokens["x"], "total" in tokens
+    (1, False)
     """
 
     __slots__ = ("_stale", "freshness", "values")
 
-    def __init__(self, values: list[Any], freshness: Freshness) -> None:
-        self.values, self.freshness = values, freshness
+    def __init__(self, cg: CompGraph, values: Mapping[str, Any] | None = None) -> None:
+        program = Program(cg, True)
+        self.values: list[Any] = [NOT_COMPUTED] * len(program.tokens)
+        for token, value in (values or {}).items():
+            cg.require_token(token)
+            self.values[program.slots[token]] = value
+        # No function is out of date; but not every token has a value.
+        self.freshness = Freshness(program, bytes(len(program.steps)), False, program.revisions())
         self._stale: set[int] | None = None
+
+    @classmethod
+    def of_run(cls, values: list[Any], freshness: Freshness) -> TokenManager:
+        """Return the tokens of a run, by slot."""
+        self = cls.__new__(cls)
+        self.values, self.freshness, self._stale = values, freshness, None
+        return self
 
     @property
     def program(self) -> Program:
@@ -126,6 +165,15 @@ class TokenManager:
         if value is NOT_COMPUTED:
             raise NotComputed(token, f"Token {token!r} has not been computed. {self._way_out(token)}")
         return lend(value) if self.program.guard else value
+
+    def __getitem__(self, token: str) -> Any:
+        return self.read(token)
+
+    def __contains__(self, token: str) -> bool:
+        return self.program.cg.has_token(token) and self.is_readable(token)
+
+    def __iter__(self) -> Iterator[str]:
+        return (token for token in self.program.tokens if self.is_readable(token))
 
     def _way_out(self, token: str) -> str:
         return (

@@ -75,6 +75,6 @@ def test_the_number_of_inputs_of_a_switch_is_checked(choose):
 
 def test_a_node_around_a_switch_is_a_switch(choose):
     pipe = ep.Pipeline("p", choose)
-    assert pipe.network.cg.switches == ("choose",)
-    assert as_switch(pipe.network.cg.functions["choose"]) is choose.functions["choose"]
+    assert pipe.network.switches == ("choose",)
+    assert as_switch(pipe.network.functions["choose"]) is choose.functions["choose"]
     assert as_switch(abs) is None
