@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 from collections.abc import Callable, Container, Iterable, Mapping
 from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -116,8 +117,9 @@ class CompGraph:
         findings += find_problems(parts, digraph, func_io, contracts, len(order) == len(digraph.inputs))
         if findings:
             raise GraphError(findings)
-        inputs, outputs = digraph.inputs, digraph.outputs
-        digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
+        if order != tuple(digraph.inputs):
+            inputs, outputs = digraph.inputs, digraph.outputs
+            digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
         self._digraph, self._types = digraph, parts.types
         self._contracts = MappingProxyType(contracts)
         self._functions = MappingProxyType({name: parts.functions[name] for name in order})
@@ -125,7 +127,8 @@ class CompGraph:
         self._known = digraph.tokens()
         self._tokens = tuple(self._known)
         self._sources = tuple(token for token in self._tokens if token not in digraph.producer)
-        self._sinks = tuple(token for token in self._tokens if token not in digraph.consumers)
+        taken = set(itertools.chain.from_iterable(digraph.inputs.values()))
+        self._sinks = tuple(token for token in self._tokens if token not in taken)
         special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
         self._placeholders = tuple(name for name, function in special if is_placeholder(function))
         self._switches = tuple(name for name, function in special if as_switch(function) is not None)

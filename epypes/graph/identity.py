@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
 
-# A mock object wraps itself without end; nobody wraps this deep on purpose.
+# A mock object wraps itself without end, and no function is wrapped this deep on purpose.
 _DEEPEST: Final = 100
 
 

@@ -39,10 +39,12 @@ def check_types(
     func_io
         The io by function name, as it was written.
     """
-    hints = _hints_by_function(functions, digraph)
+    # A large graph has few functions under many names.
+    read = {key: _read(function) for key, function in distinct(functions).items() if _is_annotated(function)}
+    hints = {name: read[id(function)] for name, function in functions.items() if id(function) in read}
     made: dict[str, Any] = {}
     for name, (_, returned) in hints.items():
-        outputs = func_io[name][1]
+        outputs = func_io[name][1] if name in func_io else None
         if isinstance(outputs, str):
             made[outputs] = returned
         elif outputs:
@@ -58,7 +60,7 @@ def check_types(
                 yield Finding("types", text, (name, *outputs))
     known: dict[tuple[int, int], bool] = {}
     for taker, (taken, _) in hints.items():
-        for token, hint in zip(digraph.inputs[taker], taken, strict=False):
+        for token, hint in zip(digraph.inputs.get(taker, ()), taken, strict=False):
             as_made = made.get(token, hint)
             if as_made is hint:
                 continue
@@ -75,20 +77,12 @@ def check_types(
                 yield Finding("types", text, (token, maker, taker))
 
 
-def _hints_by_function(
-    functions: Mapping[str, Any], digraph: BipartiteDigraph
-) -> dict[str, tuple[tuple[Any, ...], Any]]:
-    """Return the hint of each positional parameter, and of the return value, of the functions that have any."""
-    read: dict[int, tuple[tuple[Any, ...], Any]] = {}
-    for key, function in distinct(functions).items():
-        hints = hints_of(function) if _is_annotated(function) else None
-        if hints:
-            signature = signature_of(function)
-            positional = positional_of(signature) if signature is not None else ()
-            taken = tuple(hints.get(parameter.name, Any) for parameter in positional)
-            read[key] = taken, hints.get("return", Any)
-    named = {name: id(functions.get(name)) for name in digraph.inputs} if read else {}
-    return {name: read[key] for name, key in named.items() if key in read}
+def _read(function: Any) -> tuple[tuple[Any, ...], Any]:
+    """Return the hint of each positional parameter, and of the return value; Any where there is none."""
+    hints = hints_of(function)
+    signature = signature_of(function) if hints else None
+    positional = positional_of(signature) if signature is not None else ()
+    return tuple(hints.get(parameter.name, Any) for parameter in positional), hints.get("return", Any)
 
 
 def _is_annotated(function: Any) -> bool:
