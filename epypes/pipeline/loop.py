@@ -40,8 +40,9 @@ class EventLoop:
         reports its failures as when it listens itself.
     f_in
         Makes the callback's keyword arguments from an event. Events can be anything, arrays and None included.
-        Without it the callback takes the event itself. One whose class has ``ack`` and ``reject``, as a broker's has,
-        is told so when the callback has returned, or raised; after a BrokerError it is left to be delivered again.
+        Without it the callback takes the event itself. An event of a broker, whose class has ``ack`` and ``reject``, is
+        acknowledged when the callback has returned, and rejected when it raised; after a BrokerError the broker
+        delivers it again.
     on_error
         Called with the event and the exception when f_in or the callback raises; logged without one. The loop
         goes on in any case.
