@@ -17,6 +17,7 @@ from time import monotonic
 from typing import Any, Final
 
 from epypes.errors import BrokerError, StillRunning
+from epypes.pipeline.pipeline import Pipeline
 
 # How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
 # woken without putting a sentinel into them, which would be an event of theirs.
@@ -92,29 +93,29 @@ def _text_of(error: BaseException) -> str:
 
 
 class EventLoop:
-    """A daemon thread that takes events from a queue and, for each, calls ``callback(**f_in(event))``.
+    """A daemon thread that takes events from a queue and, for each, runs a pipeline or calls a function.
 
-    Without f_in it calls ``callback(event)``.
+    With a Pipeline it calls ``callback.run(**f_in(event))``, or ``callback.handle(event)`` of one that reacts to events
+    itself (SinkPipeline, FullPipeline); with any other function ``callback(**f_in(event))``. Without f_in it calls
+    ``callback(event)``.
 
     Parameters
     ----------
     q_in
         Anything with ``get(timeout=seconds)`` that raises ``queue.Empty``: queue.Queue, queue.SimpleQueue, Mailbox.
     callback
-        Called on the loop's thread.
+        A Pipeline, or a function; called on the loop's thread. A SinkPipeline or FullPipeline answers the event and
+        reports its failures as when it listens itself.
     f_in
         Makes the callback's keyword arguments from an event. Events can be anything, arrays and None included.
-        Without it the callback takes the event itself. One whose class has ``ack`` and ``reject``, as a broker's has,
-        is told so when the callback has returned, or raised; after a BrokerError it is left to be delivered again.
+        Without it the callback takes the event itself. An event of a broker, whose class has ``ack`` and ``reject``, is
+        acknowledged when the callback has returned, and rejected when it raised; after a BrokerError the broker
+        delivers it again.
     on_error
         Called with the event and the exception when f_in or the callback raises; logged without one. The loop
         goes on in any case.
     name
-        For the thread's name and for errors.
-    busy
-        Returns the functions that have not returned; for errors.
-    settle
-        Called with an event, and the exception or None, when it is over; tells whoever keeps the event.
+        For the thread's name and for errors; a pipeline's own without.
 
     Notes
     -----
@@ -128,12 +129,11 @@ class EventLoop:
         f_in: Callable[[Any], Mapping[str, Any]] | None = None,
         *,
         on_error: Callable[[Any, BaseException], None] | None = None,
-        name: str = "EventLoop",
-        busy: Callable[[], Sequence[str]] = tuple,
-        settle: Callable[[Any, BaseException | None], None] = settle,
+        name: str = "",
     ) -> None:
         self.q_in, self.callback, self.f_in, self.on_error = q_in, callback, f_in, on_error
-        self.name, self._busy, self._settle = name, busy, settle
+        self._pipeline = callback if isinstance(callback, Pipeline) else None
+        self.name = name or (self._pipeline.name if self._pipeline is not None else "EventLoop")
         self.handled = 0
         self._stop = threading.Event()
         self._draining = threading.Event()
@@ -223,10 +223,7 @@ class EventLoop:
                 stop.wait(POLL_S)
                 continue
             try:
-                if self.f_in is None:
-                    self.callback(event)
-                else:
-                    self.callback(**self.f_in(event))
+                self._handle(event)
             except BaseException as exception:  # a function's SystemExit must not end the thread in silence
                 self._report(event, exception)
                 self._settle(event, exception)
@@ -237,6 +234,21 @@ class EventLoop:
             # An event may be large: it shall not live on until another comes.
             del event
             self.handled += 1
+
+    def _handle(self, event: Any) -> None:
+        if self._pipeline is not None:
+            self._pipeline._react(event, self.f_in)
+        elif self.f_in is None:
+            self.callback(event)
+        else:
+            self.callback(**self.f_in(event))
+
+    def _settle(self, event: Any, exception: BaseException | None) -> None:
+        if self._pipeline is None or not self._pipeline._has_settled(event):
+            settle(event, exception)
+
+    def _busy(self) -> Sequence[str]:
+        return self._pipeline._busy if self._pipeline is not None else ()
 
     def _is_drained(self, stop: threading.Event) -> bool:
         """Whether the loop ends now that the queue is empty; from then on it counts as stopped."""

@@ -5,15 +5,16 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from time import perf_counter_ns
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from weakref import ref
 
-from epypes.graph import CompGraph, with_functions
+from epypes.graph import CompGraph
 from epypes.run.guard import WATCH, called_for
 
 if TYPE_CHECKING:
+    from epypes.graph.validation import GraphParts
     from epypes.run.program import Program
 
 
@@ -112,29 +113,44 @@ class Node:
         return f"<{type(self).__name__:.30} {self.name!r:.40}: {self.run_count} calls>"
 
 
-class NodeBasedCompGraph:
-    """The network of Nodes of a graph; functions that are Nodes already (a Pipeline, a subclass) are kept.
+class NodeBasedCompGraph(CompGraph):
+    """The network of Nodes of a graph: the same graph with a Node in place of each function.
 
-    Attributes
+    Functions that are Nodes already (a Pipeline, a subclass) are kept. It is drawn and run as any graph. What
+    ``ep.union`` and the other operations make of it is a CompGraph whose functions are these Nodes.
+
+    Parameters
     ----------
-    nodes
-        The nodes by function name, in run order.
     cg
-        The same graph with the nodes in place of the functions.
+        The graph; it stays as it is.
 
     Notes
     -----
     Semeniuta and Falkman 2019, "Nodes and pipelines".
+
+    Examples
+    --------
+    >>> network = NodeBasedCompGraph(CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")}))
+    >>> network.nodes["double"](21), network.sink_tokens
+    (42, ('y',))
     """
 
     def __init__(self, cg: CompGraph) -> None:
-        self.nodes: Mapping[str, Node] = MappingProxyType(
-            {
-                name: function if isinstance(function, Node) else Node(name, function)
-                for name, function in cg.functions.items()
-            }
-        )
-        self.cg = with_functions(cg, self.nodes)
+        if not isinstance(cg, CompGraph):
+            raise TypeError(f"A NodeBasedCompGraph is made of a CompGraph, not {type(cg).__name__!r}.")
+        self._build(cg._parts())
+
+    def _build(self, parts: GraphParts) -> None:
+        nodes: dict[str, Callable[..., Any]] = {
+            name: function if isinstance(function, Node) or not callable(function) else Node(name, function)
+            for name, function in parts.functions.items()
+        }
+        super()._build(replace(parts, functions=nodes))
+
+    @property
+    def nodes(self) -> Mapping[str, Node]:
+        """The nodes by function name, in run order."""
+        return cast("Mapping[str, Node]", self.functions)
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return the nodes' ``traverse_time()``, in run order."""

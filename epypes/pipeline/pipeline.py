@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import inspect
 import keyword
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Literal
 
 from epypes.errors import HyperparameterError, PayloadError
-from epypes.graph import CompGraph
-from epypes.graph.hinted import annotated_params
+from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
 from epypes.pipeline.node import Node, NodeBasedCompGraph
 from epypes.run import CompGraphRunner, Run
@@ -52,8 +51,8 @@ class Stages:
     after: tuple[Stage, ...] = ()
 
 
-class Pipeline(Node):
-    """A Node that runs a graph.
+class Pipeline(Node, Mapping[str, Any]):
+    """A Node that runs a graph; a mapping of its runner's tokens, as a CompGraphRunner is.
 
     Called with the free source tokens in order of first appearance in func_io, it returns its sink token, or a
     tuple of them in graph order: so it can be a function of another graph.
@@ -86,7 +85,7 @@ class Pipeline(Node):
             way_out = "Give its graph: .cg" if isinstance(getattr(cg, "cg", None), CompGraph) else "Pipeline(name, cg)"
             raise TypeError(f"A pipeline runs a CompGraph, not {type(cg).__name__!r}. {way_out}.")
         self.network = NodeBasedCompGraph(cg)
-        self.runner = CompGraphRunner(self.network.cg, hparams, workers=workers)
+        self.runner = CompGraphRunner(self.network, hparams, workers=workers)
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
         super().__init__(name, self.__call__)
@@ -141,6 +140,24 @@ class Pipeline(Node):
         (payload,) = args
         return self.runner.run_on(payload)
 
+    # What an EventLoop asks of its pipeline.
+
+    def _react(self, event: Any, f_in: Callable[[Any], Mapping[str, Any]] | None) -> None:
+        """Run for an event; without f_in it is the only input."""
+        if f_in is None:
+            self(event)
+        else:
+            self.run(**f_in(event))
+
+    def _has_settled(self, event: Any) -> bool:
+        """Whether the pipeline has acknowledged or rejected the event itself."""
+        return False
+
+    @property
+    def _busy(self) -> tuple[str, ...]:
+        """What has not returned, for errors: functions of the graph."""
+        return self.runner.running
+
     def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
         free = self.runner.free_source_tokens
         if len(args) != len(free):
@@ -151,6 +168,22 @@ class Pipeline(Node):
 
     def __getitem__(self, token: str) -> Any:
         return self.runner[token]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.runner)
+
+    def __len__(self) -> int:
+        return len(self.runner)
+
+    def __bool__(self) -> bool:
+        """Whether there is a pipeline: true also before its first run, as of any other function."""
+        return True
+
+    # Values may be arrays, and a pipeline changes: pipelines are told apart by identity.
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     def __setitem__(self, token: str, value: Any) -> None:
         self.runner[token] = value

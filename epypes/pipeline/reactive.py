@@ -278,9 +278,19 @@ class SinkPipeline(Pipeline):
         self._attempts = _Attempts()
         # Where the last event that failed did so, what was raised, and how many had been worked on.
         self._failed_last: tuple[str, str, int] = ("", "", 0)
-        # The event that `handle` has settled last on each thread.
-        self._settled = threading.local()
-        self.loop = EventLoop(q_in, self.handle, name=name, busy=self._busy, settle=self._settle_if_not_yet)
+        # On each thread, the f_in of its loop, if that has its own, and the event that `handle` has settled last.
+        self._own = threading.local()
+        self.loop = EventLoop(q_in, self)
+
+    def _react(self, event: Any, f_in: FIn | None) -> None:
+        if f_in is None:
+            self.handle(event)
+            return
+        self._own.f_in = f_in
+        try:
+            self.handle(event)
+        finally:
+            del self._own.f_in
 
     @property
     def working_on(self) -> Any:
@@ -297,7 +307,7 @@ class SinkPipeline(Pipeline):
         before = self.runner.last
         run: Run | None = None
         try:
-            payload = self.f_in(event)
+            payload = getattr(self._own, "f_in", self.f_in)(event)
             view.f_in_end = perf_counter_ns()
             if type(payload) is not dict:
                 self._require_mapping(payload)
@@ -327,8 +337,9 @@ class SinkPipeline(Pipeline):
             text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
             raise TypeError(text)
 
+    @property
     def _busy(self) -> tuple[str, ...]:
-        """Return what has not returned: functions of the graph, or f_in, or f_out, or the put on q_out."""
+        """What has not returned, for errors: functions of the graph, or f_in, or f_out, or the put on q_out."""
         where = [stage for stage in _where(self._events) if stage != "graph"]
         return self.runner.running or tuple("put on q_out" if stage == "q_out" else stage for stage in where)
 
@@ -380,13 +391,12 @@ class SinkPipeline(Pipeline):
             self._settle(event, exception, str(failure))
 
     def _settle(self, event: Any, exception: BaseException | None = None, text: str = "") -> None:
-        self._settled.event = event
+        self._own.event = event
         settle(event, exception, text)
 
-    def _settle_if_not_yet(self, event: Any, exception: BaseException | None) -> None:
-        """Settle an event of the loop, unless `handle` has: that of a subclass need not call this one's."""
-        if vars(self._settled).pop("event", None) is not event:
-            settle(event, exception)
+    def _has_settled(self, event: Any) -> bool:
+        """Whether ``handle`` has settled the event: that of a subclass need not call this one's."""
+        return vars(self._own).pop("event", None) is event
 
     def _failure_of(self, event: Any, where: str, exception: BaseException, run: Run | None) -> tuple[str, Failure]:
         """Return what failed, and where."""

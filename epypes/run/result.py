@@ -7,8 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
-from epypes.graph import CompGraph
-from epypes.graph.redefined import redefined
+from epypes.graph import CompGraph, redefined
 from epypes.run.failure import Failure
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.hyperparameters import Hyperparameters
@@ -84,7 +83,9 @@ class Run(Mapping[str, Any]):
             return self._tokens
         except AttributeError:
             values, dirty, has_payload, revisions, hparams, _, _ = self.record
-            self._tokens: TokenManager = TokenManager(hparams.program, values, bytearray(dirty), has_payload, revisions)
+            self._tokens: TokenManager = TokenManager.of_run(
+                hparams.program, values, bytearray(dirty), has_payload, revisions
+            )
             return self._tokens
 
     def __getitem__(self, token: str) -> Any:

@@ -11,8 +11,7 @@ from typing import Any, Final
 from weakref import ref
 
 from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
-from epypes.graph import CompGraph
-from epypes.graph.redefined import redefined
+from epypes.graph import CompGraph, redefined
 from epypes.run.execute import CompiledRun, Executor
 from epypes.run.failure import failure_of
 from epypes.run.guard import COPIERS, lend, require_reusable
@@ -30,8 +29,11 @@ _LOG: Final = logging.getLogger(__name__)
 _MAX_TARGETS: Final = 64
 
 
-class CompGraphRunner:
-    """Runs a graph; reads like a dictionary of its tokens.
+class CompGraphRunner(Mapping[str, Any]):
+    """Runs a graph; a mapping of its tokens that can be read now.
+
+    These are the hyperparameters, and what the last run has left that is not stale, in graph order. Reading any other
+    token raises; ``get`` returns its default. If other threads run it meanwhile, ``dict(runner.last)`` is of one run.
 
     Parameters
     ----------
@@ -271,7 +273,7 @@ class CompGraphRunner:
             error = raised
         program.running.discard(run)
         if error is not None:
-            tokens = TokenManager(program, values, dirty or bytearray(program.clean), True, revisions)
+            tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
             return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
         times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
@@ -523,20 +525,19 @@ class CompGraphRunner:
             raise StaleToken(token)
         return value
 
-    def __contains__(self, token: object) -> bool:
-        return token in self.keys()
-
     def __iter__(self) -> Iterator[str]:
-        return iter(self.keys())
-
-    def __len__(self) -> int:
-        return len(self.keys())
-
-    def keys(self) -> tuple[str, ...]:
-        """Return the tokens that can be read now, in graph order."""
         hparams, last = self._state
         now, frozen = self._tokens_now(hparams, last), hparams.entries
-        return tuple(token for token in self.cg.tokens if token in frozen or now.is_readable(token))
+        return iter([token for token in self.cg.tokens if token in frozen or now.is_readable(token)])
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    # Values may be arrays, and a runner changes: runners are told apart by identity.
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     def __repr__(self) -> str:
         last, redefinitions = self.last, len(redefined(self.cg))

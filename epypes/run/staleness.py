@@ -6,10 +6,11 @@ The cost does not depend on the size of the values.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StaleToken
+from epypes.graph import CompGraph
 from epypes.run.guard import is_plain_array, is_same_guarded_array, lend
 from epypes.run.program import Program, Step
 
@@ -33,9 +34,22 @@ NOT_COMPUTED: Final = _NotComputed()
 
 
 class TokenManager:
-    """The token values of one run; they do not change any more when the run has ended.
+    """The values of a graph's tokens; they do not change any more when their run has ended.
 
-    Each run works on values of its own, so concurrent runs never see each other's.
+    A runner delegates storage to it: each run works on values of its own, so concurrent runs never see each other's,
+    and leaves them as ``run.tokens``.
+
+    Parameters
+    ----------
+    cg
+        The graph.
+    values
+        By token, the values that are known and up to date; none without.
+
+    Raises
+    ------
+    UnknownName
+        The graph has no such token.
 
     Attributes
     ----------
@@ -55,11 +69,31 @@ class TokenManager:
     origin
         The steps that were dirty before anything was changed, of which it is not known what was new to them; None in a
         run from scratch.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Computational graphs".
+
+    Examples
+    --------
+    >>> cg = CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")})
+    >>> tokens = TokenManager(cg, {"x": 1})
+    >>> tokens["x"], "total" in tokens
+    (1, False)
     """
 
     __slots__ = ("_new", "_stale", "dirty", "has_payload", "origin", "program", "revisions", "running", "values")
 
-    def __init__(
+    def __init__(self, cg: CompGraph, values: Mapping[str, Any] | None = None) -> None:
+        program = Program(cg, True)
+        stored: list[Any] = [NOT_COMPUTED] * len(program.tokens)
+        for token, value in (values or {}).items():
+            cg.require_token(token)
+            stored[program.slots[token]] = value
+        # No function is out of date; but not every token has a value.
+        self._set(program, stored, bytearray(program.clean), False, program.revisions())
+
+    def _set(
         self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
     ) -> None:
         self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
@@ -71,16 +105,27 @@ class TokenManager:
         self._stale: set[int] | None = None
 
     @classmethod
+    def of_run(
+        cls, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
+    ) -> TokenManager:
+        """Return the tokens of a run, by slot."""
+        tokens = cls.__new__(cls)
+        tokens._set(program, values, dirty, has_payload, revisions)
+        return tokens
+
+    @classmethod
     def from_scratch(cls, program: Program, values: list[Any], has_payload: bool) -> TokenManager:
         """Return tokens of which only source tokens have values."""
-        return cls(program, values, bytearray(b"\1") * len(program.steps), has_payload, program.revisions())
+        return cls.of_run(program, values, bytearray(b"\1") * len(program.steps), has_payload, program.revisions())
 
     # -- while functions run ------------------------------------------------------------------------------------
 
     def branch(self) -> TokenManager:
         """Return tokens with the same values, for a run that goes on from these."""
         program = self.program
-        branch = TokenManager(program, self.values.copy(), self.dirty.copy(), self.has_payload, program.revisions())
+        branch = TokenManager.of_run(
+            program, self.values.copy(), self.dirty.copy(), self.has_payload, program.revisions()
+        )
         for place, before, now in zip(program.revised, self.revisions, branch.revisions, strict=True):
             branch.dirty[place] |= before != now
         branch.origin = bytes(branch.dirty)
@@ -172,6 +217,15 @@ class TokenManager:
             way_out = f"Pass it: run({token}=...)." if is_source else way_out
             raise NotComputed(token, f"Token {token!r} has not been computed. {way_out}")
         return lend(value) if program.guard else value
+
+    def __getitem__(self, token: str) -> Any:
+        return self.read(token)
+
+    def __contains__(self, token: str) -> bool:
+        return self.program.cg.has_token(token) and self.is_readable(token)
+
+    def __iter__(self) -> Iterator[str]:
+        return (token for token in self.program.tokens if self.is_readable(token))
 
 
 def is_same_value(old: Any, new: Any) -> bool:

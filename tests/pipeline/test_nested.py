@@ -47,7 +47,7 @@ def test_a_hyperparameter_inside_makes_what_depends_on_it_stale_outside(depth):
     assert nest.runner.stale == ("nested", "after")
     assert nest.runner.plan().reused == ("before",)
     assert nest.runner.plan().why["nested"] == "an input, or a hyperparameter inside it, has changed since it ran"
-    assert nest.runner.keys() == ("a", "b")
+    assert tuple(nest.runner) == ("a", "b")
     with pytest.raises(StaleToken, match=r"'d' is stale.*Call rerun\(\)"):
         nest.runner["d"]
     assert run["d"] == 11, "a Run does not change"
