@@ -31,8 +31,8 @@ class Stage:
     name
         Such as ``"q_in"``.
     state
-        ``"running"``: of a loop that it listens, of a function that an event is in it, of a queue that somebody waits
-        to put something on it; ``"failed"``: of a function that the last event failed in it.
+        ``"running"``: of a loop that it listens, of a function that an event is in it, of a queue that an answer
+        waits to be put on it; ``"failed"``: of a function that the last event failed in it.
     notes
         Short lines: what it is, its counts.
     """

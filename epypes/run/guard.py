@@ -202,7 +202,7 @@ def keep(value: Any, fresh_count: int, program: Program, slot: int, values: Sequ
     """Return what a function returned as it is stored: arrays locked, and copied where others could write to them.
 
     A function that goes on using the memory of its result would change a value that has been handed out. So an
-    array to which somebody else holds a reference is copied; a new one, the usual case, is locked as it is. The same
+    array to which others hold a reference is copied; a new one, the usual case, is locked as it is. The same
     goes for mutable containers, and for the arrays in them and in tuples.
 
     Parameters

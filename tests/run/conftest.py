@@ -1,4 +1,4 @@
-"""In which ways can a graph be run?"""
+"""The ways in which a graph can be run: step by step, compiled, side by side."""
 
 from __future__ import annotations
 

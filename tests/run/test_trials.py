@@ -1,4 +1,4 @@
-"""Can values be tried without changing the runner, and then be taken over in one step?"""
+"""Values are tried without changing the runner, and then taken over in one step."""
 
 from __future__ import annotations
 
