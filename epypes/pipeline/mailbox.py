@@ -83,7 +83,7 @@ class Mailbox:
     def hand_to(self, take: Callable[[Any], object], /) -> Callable[[], None]:
         """Have each item handed over within `put`, on the thread that puts, instead of kept; return what ends that.
 
-        So no thread has to wait in `get`, and no thread has to be woken up: what a ZMQPublisher takes has been sent when
+        So no thread has to wait in `get`, and none has to be woken up: what a ZMQPublisher takes has been sent when
         ``put`` returns. What is kept already is handed over first, and then ``take`` must not raise; later what it
         raises comes out of ``put``. It must let several threads call it at once.
 
@@ -108,7 +108,7 @@ class Mailbox:
         return end
 
     def _keep(self, item: Any, block: bool, timeout: float | None) -> Callable[[Any], object] | None:
-        """Keep an item until it is taken; return the taker that it must be handed to, if there has come one meanwhile."""
+        """Keep an item until it is taken; return the taker that it must be handed to, if one has come meanwhile."""
         _require_timeout(block, timeout)
         with self._changed:
             dropped: list[Any] = []
