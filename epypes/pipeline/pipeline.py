@@ -119,9 +119,10 @@ class Pipeline(Node, Mapping[str, Any]):
 
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
+        start_ns = perf_counter_ns()
         # In place before the run, whose functions fill the caches: after it each look-up takes a microsecond.
         self._called = called = [*self._called]
-        count, start_ns = self._next_count(), perf_counter_ns()
+        count = self._next_count()
         try:
             run: Run = self.compute(payload)
             return run
