@@ -271,7 +271,8 @@ class CompGraphRunner(Mapping[str, Any]):
             compiled(run, values, dirty, durations_ns)
         except BaseException as raised:
             error = raised
-        program.running.discard(run)
+        finally:
+            program.running.discard(run)
         if error is not None:
             tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
