@@ -260,6 +260,10 @@ class SinkPipeline(Pipeline):
         How many events failed.
     """
 
+    f_out: Any
+    # Whether `handle` puts the answer of f_out on q_out itself, which takes a call less than `emit`.
+    _has_usual_emit = False
+
     def __init__(
         self,
         name: str,
@@ -278,19 +282,21 @@ class SinkPipeline(Pipeline):
         self._attempts = _Attempts()
         # Where the last event that failed did so, what was raised, and how many had been worked on.
         self._failed_last: tuple[str, str, int] = ("", "", 0)
-        # On each thread, the f_in of its loop, if that has its own, and the event that `handle` has settled last.
-        self._own = threading.local()
+        # By thread, the f_in of its loop, if that has its own.
+        self._f_ins: dict[int, FIn] = {}
+        # The event that `handle` has settled last on each thread.
+        self._settled = threading.local()
         self.loop = EventLoop(q_in, self)
 
     def _react(self, event: Any, f_in: FIn | None) -> None:
         if f_in is None:
             self.handle(event)
             return
-        self._own.f_in = f_in
+        self._f_ins[get_ident()] = f_in
         try:
             self.handle(event)
         finally:
-            del self._own.f_in
+            del self._f_ins[get_ident()]
 
     @property
     def working_on(self) -> Any:
@@ -299,15 +305,16 @@ class SinkPipeline(Pipeline):
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
-        view = EventView(self.name, event)
-        self._events[get_ident()] = view
+        view, thread = EventView(self.name, event), get_ident()
+        self._events[thread] = view
+        f_in = self._f_ins.get(thread, self.f_in) if self._f_ins else self.f_in
         # Looked up now: a function of the graph fills the caches with its image, and each look-up takes microseconds.
-        clock, f_out, put = perf_counter_ns, self._emits_by(), self.put
+        clock, f_out, put = perf_counter_ns, self.f_out if self._has_usual_emit else None, self.put
         # To free the tokens of the run before takes its time: that is done when the answer is on its way.
         before = self.runner.last
         run: Run | None = None
         try:
-            payload = getattr(self._own, "f_in", self.f_in)(event)
+            payload = f_in(event)
             view.f_in_end = perf_counter_ns()
             if type(payload) is not dict:
                 self._require_mapping(payload)
@@ -327,9 +334,9 @@ class SinkPipeline(Pipeline):
         except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
             self._fail(view, exception, run)
         else:
-            if is_kept(event):
+            if getattr(type(event), "ack", None) is not None:  # is_kept
                 self._settle(event)
-        self._events.pop(get_ident(), None)
+        self._events.pop(thread, None)
         del before
 
     def _require_mapping(self, payload: Any) -> None:
@@ -370,10 +377,6 @@ class SinkPipeline(Pipeline):
     def put(self, answer: Any, view: EventView) -> None:
         """Put an answer on q_out; a SinkPipeline has none. The hook for subclasses."""
 
-    def _emits_by(self) -> FOut | None:
-        """Return the f_out whose answer `handle` puts on q_out itself; None if it is to call `emit`."""
-        return None
-
     def _fail(self, view: EventView, exception: BaseException, run: Run | None) -> None:
         event, where = view.event, "f_out" if view.stage == "q_out" else view.stage
         view.stage = ""
@@ -391,12 +394,12 @@ class SinkPipeline(Pipeline):
             self._settle(event, exception, str(failure))
 
     def _settle(self, event: Any, exception: BaseException | None = None, text: str = "") -> None:
-        self._own.event = event
+        self._settled.event = event
         settle(event, exception, text)
 
     def _has_settled(self, event: Any) -> bool:
         """Whether ``handle`` has settled the event: that of a subclass need not call this one's."""
-        return vars(self._own).pop("event", None) is event
+        return vars(self._settled).pop("event", None) is event
 
     def _failure_of(self, event: Any, where: str, exception: BaseException, run: Run | None) -> tuple[str, Failure]:
         """Return what failed, and where."""
@@ -496,9 +499,6 @@ class FullPipeline(_Answering, SinkPipeline):
         super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
         self._has_usual_emit = type(self).emit is FullPipeline.emit
-
-    def _emits_by(self) -> FOut | None:
-        return self.f_out if self._has_usual_emit else None
 
     @property
     def stages(self) -> Stages:
