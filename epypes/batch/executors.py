@@ -37,7 +37,7 @@ from epypes.batch.results import ErrorInfo, Outcome
 from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ScaleError
 from epypes.run import CompGraphRunner
-from epypes.run.branch import branched
+from epypes.run.runner import branched
 from epypes.wording import counted, ended
 
 # How soon a stop is noticed while nothing comes, and a Ctrl+C that another thread was given, which does not wake a main

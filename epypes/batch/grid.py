@@ -22,7 +22,7 @@ from epypes.graph import CompGraph
 from epypes.hints import Param, as_param, odd_step, param_from_value
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
-from epypes.run.branch import branched
+from epypes.run.runner import branched
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

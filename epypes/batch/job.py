@@ -13,7 +13,7 @@ from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
 from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner
-from epypes.run.branch import branched
+from epypes.run.runner import branched
 
 Setting = Mapping[str, Any]
 # One object, since settings are compared by identity.

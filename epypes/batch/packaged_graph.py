@@ -29,8 +29,8 @@ from epypes.bundle.manifest import REQUIREMENTS, SAMPLES
 from epypes.bundle.settings import Unwritable, decode_value, encode_value, members_in
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
-from epypes.run.branch import branched
 from epypes.run.guard import is_plain_array
+from epypes.run.runner import branched
 from epypes.wire import Envelope, decode, encode
 from epypes.wording import ended
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import MessageError, StateChanged
 from epypes.pipeline import EventView
-from epypes.pipeline.answering import FOut
-from epypes.pipeline.stamps import Stamps
+from epypes.pipeline.reactive import FOut
 from epypes.run import Run
 from epypes.run.guard import is_array
 
@@ -130,7 +129,7 @@ def answer_of(f_out: FOut, name: str, run: Run, attributes: Mapping[str, Any]) -
     from epypes.wire import Envelope
 
     try:
-        answer = f_out(EventView(name, Envelope("epypes.sample", id="sample"), run, attributes, Stamps()))
+        answer = f_out(EventView.of_run(name, Envelope("epypes.sample", id="sample"), run, attributes))
     except StateChanged:
         raise
     except Exception:  # whatever a user's function does that misses its event

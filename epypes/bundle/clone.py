@@ -116,7 +116,8 @@ _HOOKS: Final = ("__call__", "compute", "run", "handle", "emit", "stages", "f_in
 # What nodes and pipelines of EPypes keep of a run, or hand to each other.
 _OF_EPYPES: Final = frozenset({
     *vars(Node("node", len)), "__wrapped__", "network", "runner", "source_cg", "attributes", "q_in", "q_out", "f_in",
-    "f_out", "on_error", "failed", "working_on", "_attempts", "_failed_last", "_own", "loop",
+    "f_out", "on_error", "failed", "_attempts", "_events", "_f_ins", "_failed_last", "_has_usual_emit", "_settled",
+    "loop",
 })  # fmt: skip
 
 

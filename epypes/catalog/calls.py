@@ -18,7 +18,7 @@ from types import FunctionType, ModuleType
 from typing import Any, Final
 
 from epypes.catalog.lookup import CatalogEntry, entry_of
-from epypes.graph.redefined import unwrapped
+from epypes.graph import unwrapped
 
 _CONVERSIONS: Final = ("int", "float", "round", "bool")
 # A user's function may call another, and that another.

@@ -18,7 +18,7 @@ from epypes.display.views.times import report_times, summary_times
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
 from epypes.run import Plan, RunReport, TimingSummary
-from epypes.run.report import Reports
+from epypes.run.timing import Reports
 
 
 def mimebundle(shown: Any) -> dict[str, str]:

@@ -1,13 +1,22 @@
 """What is connected to what: computational graphs, pure and static."""
 
-from epypes.graph.algebra import extend, subgraph, union, with_defaults, with_functions
+from epypes.graph.algebra import (
+    extend,
+    group,
+    names_of,
+    rename,
+    subgraph,
+    suffix,
+    union,
+    with_defaults,
+    with_functions,
+)
 from epypes.graph.compgraph import CompGraph
-from epypes.graph.group import group
-from epypes.graph.hinted import annotated_params, colour_order, image_hint
-from epypes.graph.outputs import outputs
-from epypes.graph.placeholder import Placeholder, is_placeholder, layers
-from epypes.graph.renaming import rename, suffix
+from epypes.graph.identity import inner_graph, is_redefined_inside, redefined, unwrapped
+from epypes.graph.placeholder import Placeholder, is_placeholder
+from epypes.graph.signature import outputs
 from epypes.graph.switch import Switch, as_switch, switch
+from epypes.graph.token_annotations import annotated_params, colour_order, image_hint
 
 __all__ = [
     "CompGraph",
@@ -19,14 +28,18 @@ __all__ = [
     "extend",
     "group",
     "image_hint",
+    "inner_graph",
     "is_placeholder",
-    "layers",
+    "is_redefined_inside",
+    "names_of",
     "outputs",
+    "redefined",
     "rename",
     "subgraph",
     "suffix",
     "switch",
     "union",
+    "unwrapped",
     "with_defaults",
     "with_functions",
 ]

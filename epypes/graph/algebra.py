@@ -1,20 +1,16 @@
-"""How do graphs become a larger graph, or a smaller one?"""
+"""Algebra of graphs: union, extension, renaming, subgraphs and groups, each of which makes a new graph."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import MethodType
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
-from epypes.errors import Finding, require_mapping
-from epypes.graph.compgraph import CompGraph
-from epypes.graph.parts import Default, Parts, defaults_of, groups_of
+from epypes.errors import Finding, GraphError, UnknownName, require_mapping
+from epypes.graph.compgraph import CompGraph, FuncIO
+from epypes.graph.identity import have_one_name, is_same_function
 from epypes.graph.placeholder import is_placeholder
-from epypes.graph.redefined import have_one_name, is_defined_alike
-from epypes.graph.renaming import names_of, require_graph, require_names, suffixed
-
-if TYPE_CHECKING:
-    from epypes.graph.compgraph import FuncIO
+from epypes.graph.validation import Default, GraphParts
 
 
 def union(*graphs: CompGraph, suffixes: Sequence[str] | None = None, keep: str | Iterable[str] = ()) -> CompGraph:
@@ -47,64 +43,48 @@ def union(*graphs: CompGraph, suffixes: Sequence[str] | None = None, keep: str |
     ('x_1', 'k', 'y_1', 'x_2', 'y_2')
     """
     for cg in graphs:
-        require_graph("union()", cg)
+        _require_graph("union()", cg)
     kept = names_of("keep", keep)
-    require_names(kept, graphs, "to keep in these graphs")
-    parts = [Parts.of(cg) for cg in graphs] if suffixes is None else _suffixed(graphs, suffixes, kept)
-    merged = Parts()
-    for part in parts:
-        _merge(merged, part)
-    return CompGraph._assemble(merged, all(cg.types for cg in graphs))
-
-
-def _suffixed(graphs: Sequence[CompGraph], suffixes: Sequence[str], keep: Sequence[str]) -> list[Parts]:
-    if isinstance(suffixes, str) or not isinstance(suffixes, Sequence) or len(suffixes) != len(graphs):
+    _require_names(kept, graphs, "to keep in these graphs")
+    if suffixes is None:
+        parts = [cg._parts() for cg in graphs]
+    elif isinstance(suffixes, str) or not isinstance(suffixes, Sequence) or len(suffixes) != len(graphs):
         text = f"union() of {len(graphs)} graphs needs a sequence of {len(graphs)} suffixes, one per graph, not "
         raise ValueError(f"{text}{suffixes!r}.")
-    return [suffixed(cg, ending, keep) for cg, ending in zip(graphs, suffixes, strict=True)]
+    else:
+        parts = [_suffixed(cg, ending, kept) for cg, ending in zip(graphs, suffixes, strict=True)]
+    merged = GraphParts(types=all(cg.types for cg in graphs))
+    for part in parts:
+        _merge(merged, part)
+    return CompGraph._of(merged)
 
 
-def _merge(merged: Parts, part: Parts) -> None:
-    """Add a part; a function that is there already is added to the findings unless it is the same."""
+def _merge(merged: GraphParts, part: GraphParts) -> None:
+    """Add a part; a function or group that is there already is added to the findings unless it is the same."""
     merged.findings.extend(part.findings)
     merged.defaults.extend(part.defaults)
-    _merge_groups(merged, part)
+    for name, group_name in part.groups.items():
+        other = merged.groups.setdefault(name, group_name)
+        if other != group_name:
+            text = (
+                f"Function {name!r} is in the group {other!r} of one graph and in {group_name!r} of another. "
+                "Group the functions after the union, or rename one of the functions with ep.rename()."
+            )
+            merged.findings.append(Finding("groups", text, (name, other, group_name)))
     for name, function in part.functions.items():
         if name not in merged.functions:
             merged.functions[name], merged.func_io[name] = function, part.func_io[name]
-        elif not _is_same(merged.functions[name], function) or not _is_same_io(
-            merged.func_io[name], part.func_io[name]
-        ):
-            text = f"Two graphs have a function {name!r}, with another callable or io. "
-            if merged.functions[name] is not function and have_one_name(merged.functions[name], function):
-                text += "It was defined again in between: build both graphs anew. If both are meant: "
-            text += "Rename one of them with ep.rename(), or give union() suffixes."
-            merged.findings.append(Finding("two functions", text, (name,)))
-
-
-def _merge_groups(merged: Parts, part: Parts) -> None:
-    """Add the groups of a part; those of one name are one."""
-    for function, name in part.groups.items():
-        other = merged.groups.setdefault(function, name)
-        if other != name:
-            text = (
-                f"Function {function!r} is in the group {other!r} of one graph and in {name!r} of another. "
-                "Group the functions after the union, or rename one of the functions with ep.rename()."
-            )
-            merged.findings.append(Finding("groups", text, (function, other, name)))
-
-
-def _is_same_io(left: Any, right: Any) -> bool:
-    # ("x", "y") and (("x",), "y") are one io; "y" and ("y",) are not one output.
-    return names_of("inputs", left[0]) == names_of("inputs", right[0]) and bool(left[1] == right[1])
-
-
-def _is_same(left: Any, right: Any) -> bool:
-    # A bound method is a new object each time it is read; two are equal if they are bound to one object.
-    if type(left) is MethodType and type(right) is MethodType:
-        return left == right
-    # The cell of a function that was run again, unchanged, makes another object of it.
-    return left is right or (have_one_name(left, right) and is_defined_alike(left, right))
+            continue
+        known, known_io, io = merged.functions[name], merged.func_io[name], part.func_io[name]
+        # ("x", "y") and (("x",), "y") are one io; "y" and ("y",) are not one output.
+        is_same_io = known_io[1] == io[1] and names_of("inputs", known_io[0]) == names_of("inputs", io[0])
+        if is_same_io and is_same_function(known, function):
+            continue
+        text = f"Two graphs have a function {name!r}, with another callable or io. "
+        if known is not function and have_one_name(known, function):
+            text += "It was defined again in between: build both graphs anew. If both are meant: "
+        text += "Rename one of them with ep.rename(), or give union() suffixes."
+        merged.findings.append(Finding("two functions", text, (name,)))
 
 
 def extend(cg: CompGraph, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO | None = None) -> CompGraph:
@@ -126,16 +106,16 @@ def extend(cg: CompGraph, func_dict: Mapping[str, Callable[..., Any]], func_io: 
 
     Examples
     --------
-    >>> from epypes.graph.placeholder import Placeholder
+    >>> from epypes.graph import Placeholder
     >>> sketch = CompGraph({"f": Placeholder()}, {"f": ("x", "y")})
     >>> extend(sketch, {"f": abs}).placeholders
     ()
     """
-    require_graph("extend()", cg)
+    _require_graph("extend()", cg)
     func_io = {} if func_io is None else func_io
     for what, given in (("func_dict", func_dict), ("func_io", func_io)):
         require_mapping(what, given, "by function name")
-    parts = Parts.of(cg)
+    parts = cg._parts()
     for name in dict.fromkeys([*func_dict, *func_io]):
         if name in cg.functions and not is_placeholder(cg.functions[name]):
             text = (
@@ -148,7 +128,7 @@ def extend(cg: CompGraph, func_dict: Mapping[str, Callable[..., Any]], func_io: 
             parts.functions[name] = func_dict[name]
         if name in func_io:
             parts.func_io[name] = func_io[name]
-    return CompGraph._assemble(parts, cg.types)
+    return CompGraph._of(parts)
 
 
 def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
@@ -172,25 +152,184 @@ def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
     >>> list(subgraph(cg, "y").functions)
     ['f']
     """
-    require_graph("subgraph()", cg)
-    producer = cg.digraph.producer
+    _require_graph("subgraph()", cg)
     pending = list(names_of("targets", targets))
     for token in pending:
         cg.require_token(token)
     needed: set[str] = set()
     while pending:
-        function = producer.get(pending.pop())
+        function = cg.digraph.producer.get(pending.pop())
         if function is not None and function not in needed:
             needed.add(function)
             pending.extend(cg.digraph.inputs[function])
-    whole = Parts.of(cg)
-    parts = Parts(
-        {name: function for name, function in whole.functions.items() if name in needed},
-        {name: io for name, io in whole.func_io.items() if name in needed},
-        whole.defaults,
-        groups={name: group for name, group in whole.groups.items() if name in needed},
+    parts = cg._parts()
+    for name in [name for name in parts.functions if name not in needed]:
+        del parts.functions[name], parts.func_io[name]
+        parts.groups.pop(name, None)
+    return CompGraph._of(parts)
+
+
+def rename(
+    cg: CompGraph, functions: Mapping[str, str] | None = None, tokens: Mapping[str, str] | None = None
+) -> CompGraph:
+    """Give functions and tokens of a graph other names.
+
+    Parameters
+    ----------
+    cg
+        The graph; it stays as it is.
+    functions, tokens
+        New names by old ones. All change at once, so two can exchange their names.
+
+    Raises
+    ------
+    GraphError
+        Two functions or two tokens would have one name.
+    UnknownName
+        The graph has no such function or token.
+
+    Examples
+    --------
+    >>> cg = CompGraph({"f": abs}, {"f": ("x", "y")})
+    >>> rename(cg, tokens={"y": "size"}).tokens
+    ('x', 'size')
+    """
+    _require_graph("rename()", cg)
+    functions, tokens = functions or {}, tokens or {}
+    for what, names, require in (
+        ("functions", functions, cg.require_function),
+        ("tokens", tokens, cg.require_token),
+    ):
+        require_mapping(what, names, "from old to new names")
+        for old, new in names.items():
+            require(old)
+            if not isinstance(new, str) or not new:
+                raise TypeError(f"The new name of {old!r} must be a string that is not empty, not {new!r}.")
+    return _built(_renamed(cg, functions, tokens))
+
+
+def suffix(cg: CompGraph, ending: str, keep: str | Iterable[str] = ()) -> CompGraph:
+    """Add an ending to the names of all functions and tokens of a graph.
+
+    Parameters
+    ----------
+    cg
+        The graph; it stays as it is.
+    ending
+        Such as ``"_1"``.
+    keep
+        Functions and tokens that keep their name.
+
+    Raises
+    ------
+    GraphError
+        A new name is that of something that is kept.
+    UnknownName
+        The graph has no name that is in ``keep``.
+
+    Examples
+    --------
+    >>> cg = CompGraph({"f": lambda x, k: x}, {"f": (("x", "k"), "y")})
+    >>> suffix(cg, "_1", keep="k").func_io["f_1"]
+    (('x_1', 'k'), 'y_1')
+    """
+    _require_graph("suffix()", cg)
+    kept = names_of("keep", keep)
+    _require_names(kept, [cg], "in this graph")
+    return _built(_suffixed(cg, ending, kept))
+
+
+def _suffixed(cg: CompGraph, ending: str, keep: Iterable[str]) -> GraphParts:
+    """Return the parts of a graph with an ending on every name that is not kept, those of its groups included."""
+    if not isinstance(ending, str):
+        raise TypeError(f'A suffix must be a string, such as "_1", not {ending!r}.')
+    kept = frozenset(keep)
+    parts = _renamed(
+        cg,
+        {name: name + ending for name in cg.functions if name not in kept},
+        {token: token + ending for token in cg.tokens if token not in kept},
     )
-    return CompGraph._assemble(parts, cg.types)
+    # A function that is kept is shared with other graphs, so it stays in the group of the old name.
+    groups = {name: group if name in kept else group + ending for name, group in parts.groups.items()}
+    return replace(parts, groups=groups)
+
+
+def _renamed(cg: CompGraph, functions: Mapping[str, str], tokens: Mapping[str, str]) -> GraphParts:
+    """Return the parts of a graph under new names; names that become one are findings."""
+    findings = [*_collisions("function", cg.functions, functions), *_collisions("token", cg.tokens, tokens)]
+    parts = cg._parts()
+    new = {name: functions.get(name, name) for name in cg.functions}
+
+    def renamed_side(side: Any) -> Any:
+        return tuple(map(renamed_side, side)) if isinstance(side, tuple) else tokens.get(side, side)
+
+    return GraphParts(
+        {new[name]: function for name, function in parts.functions.items()},
+        {new[name]: renamed_side(io) for name, io in parts.func_io.items()},
+        [Default(tokens.get(token, token), value, new[name]) for token, value, name in parts.defaults],
+        {new[name]: group for name, group in parts.groups.items()},
+        parts.types,
+        findings,
+    )
+
+
+def _collisions(kind: str, names: Iterable[str], new: Mapping[str, str]) -> Iterable[Finding]:
+    first: dict[str, str] = {}
+    for name in names:
+        target = new.get(name, name)
+        other = first.setdefault(target, name)
+        if other != name:
+            text = f"The {kind}s {other!r} and {name!r} would both be called {target!r}. Choose another name for one."
+            yield Finding("one name", text, (other, name, target))
+
+
+def group(cg: CompGraph, name: str, functions: str | Iterable[str]) -> CompGraph:
+    """Group functions of a graph: it is drawn with one box for them, which opens.
+
+    Groups are for the eye only: nothing runs otherwise, and no name is changed.
+
+    Parameters
+    ----------
+    cg
+        The graph; it stays as it is.
+    name
+        What stands on the box. ``union`` with suffixes and ``suffix`` add theirs to it.
+    functions
+        The functions inside.
+
+    Raises
+    ------
+    GraphError
+        There is no function in it; one is in another group already; a group, or a function outside it, is called so.
+    UnknownName
+        The graph has no such function.
+
+    Examples
+    --------
+    >>> cg = CompGraph({"f": abs, "g": abs}, {"f": ("x", "y"), "g": ("y", "z")})
+    >>> dict(group(cg, "both", functions=["f", "g"]).groups)
+    {'both': ('f', 'g')}
+    """
+    _require_graph("group()", cg)
+    if not isinstance(name, str) or not name:
+        raise TypeError(f"The name of a group must be a string that is not empty, not {name!r}.")
+    inside = dict.fromkeys(names_of("functions", functions))
+    for function in inside:
+        cg.require_function(function)
+    parts = cg._parts()
+    if not inside:
+        text = f"The group {name!r} would have no function. Name at least one: functions=[...]."
+        parts.findings.append(Finding("groups", text, (name,)))
+    if name in cg.groups:
+        text = f"There is a group {name!r} already, of {', '.join(cg.groups[name])}. Choose another name."
+        parts.findings.append(Finding("groups", text, (name,)))
+    for function in inside:
+        if function in parts.groups:
+            other = parts.groups[function]
+            text = f"Function {function!r} is in the group {other!r} already. A function is in one group at most."
+            parts.findings.append(Finding("groups", text, (function, other)))
+        parts.groups[function] = name
+    return _built(parts)
 
 
 def with_functions(cg: CompGraph, functions: Mapping[str, Callable[..., Any]]) -> CompGraph:
@@ -203,9 +342,7 @@ def with_functions(cg: CompGraph, functions: Mapping[str, Callable[..., Any]]) -
     functions
         A callable for every function, by name.
     """
-    return CompGraph._assemble(
-        Parts(dict(functions), dict(cg.func_io), defaults_of(cg), groups=groups_of(cg)), cg.types
-    )
+    return CompGraph._of(replace(cg._parts(), functions=dict(functions)))
 
 
 def with_defaults(cg: CompGraph, values: Mapping[str, Any]) -> CompGraph:
@@ -220,4 +357,35 @@ def with_defaults(cg: CompGraph, values: Mapping[str, Any]) -> CompGraph:
     """
     readers = cg.digraph.consumers
     defaults = [Default(token, value, readers[token][0]) for token, value in values.items() if token in readers]
-    return CompGraph._assemble(Parts(dict(cg.functions), dict(cg.func_io), defaults, groups=groups_of(cg)), cg.types)
+    return CompGraph._of(replace(cg._parts(), defaults=defaults))
+
+
+def _built(parts: GraphParts) -> CompGraph:
+    """Make a graph of parts, unless something is wrong with them already: what follows from that is not reported."""
+    if parts.findings:
+        raise GraphError(parts.findings)
+    return CompGraph._of(parts)
+
+
+def names_of(what: str, names: str | Iterable[str]) -> tuple[str, ...]:
+    """Return one name or several as a tuple; ``what`` is the argument, for the error."""
+    if isinstance(names, str):
+        return (names,)
+    if not isinstance(names, Iterable):
+        raise TypeError(f"{what} must be a name or an iterable of names, not {type(names).__name__!r}.")
+    return tuple(names)
+
+
+def _require_names(names: Iterable[str], graphs: Iterable[CompGraph], where: str) -> None:
+    """Raise UnknownName, with the nearest name, unless each is that of a function or token in one of the graphs."""
+    known = dict.fromkeys(name for cg in graphs for name in (*cg.functions, *cg.tokens))
+    for name in names:
+        if name not in known:
+            raise UnknownName("function or token", name, known, where)
+
+
+def _require_graph(what: str, cg: object) -> None:
+    """Raise unless this is a graph, with the way to the graph of a runner or a pipeline."""
+    if not isinstance(cg, CompGraph):
+        way_out = "Give its graph: .cg." if hasattr(cg, "cg") else "Make one with ep.CompGraph(func_dict, func_io)."
+        raise TypeError(f"{what} takes computational graphs, not {type(cg).__name__!r}. {way_out}")

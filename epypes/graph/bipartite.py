@@ -1,4 +1,4 @@
-"""In which order can functions run, and where is the shortest cycle?
+"""The bipartite digraph of functions and tokens: its order and its shortest cycle.
 
 A computational graph G = (F, T, E) is a bipartite digraph of functions F and tokens T (Semeniuta and
 Falkman 2019). The two kinds of vertex live in separate name spaces, so a function may be called like a token.
@@ -10,7 +10,7 @@ import heapq
 import itertools
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 
@@ -22,39 +22,39 @@ class BipartiteDigraph:
     ----------
     inputs, outputs
         By function name, its input and output tokens; the order of the functions is the order of definition.
-    producer
-        By token, the function that makes it (the first one, where a faulty graph has several).
     """
 
     inputs: Mapping[str, tuple[str, ...]]
     outputs: Mapping[str, tuple[str, ...]]
-    producer: dict[str, str] = field(init=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def producer(self) -> dict[str, str]:
+        """By token, the function that makes it (the first one, where a faulty graph has several)."""
         producer: dict[str, str] = {}
         for function, tokens in self.outputs.items():
             for token in tokens:
-                if token not in producer:
-                    producer[token] = function
-        object.__setattr__(self, "producer", producer)
+                producer.setdefault(token, function)
+        return producer
 
     @cached_property
     def consumers(self) -> dict[str, list[str]]:
-        """By token, the functions that take it, in order of definition. Made when it is asked for: a run is not."""
+        """By token, the functions that take it, in order of definition."""
         consumers: dict[str, list[str]] = {}
         for function, tokens in self.inputs.items():
             for token in dict.fromkeys(tokens):
                 consumers.setdefault(token, []).append(function)
         return consumers
 
+    def tokens(self) -> dict[str, None]:
+        """Return every token once, by first appearance, inputs before outputs."""
+        sides = zip(self.inputs.values(), self.outputs.values(), strict=True)
+        return dict.fromkeys(itertools.chain.from_iterable(itertools.chain.from_iterable(sides)))
+
     def successors(self, function: str) -> Iterable[str]:
         """Return the functions that take an output of ``function``, each once, in order of definition."""
-        return dict.fromkeys(
-            consumer
-            for token in self.outputs[function]
-            if self.producer[token] == function  # in a faulty graph a token may have a second producer
-            for consumer in self.consumers.get(token, ())
-        )
+        # In a faulty graph a token may have a second producer.
+        made = (token for token in self.outputs[function] if self.producer[token] == function)
+        return dict.fromkeys(itertools.chain.from_iterable(self.consumers.get(token, ()) for token in made))
 
     def predecessors(self, function: str) -> Iterable[str]:
         """Return the functions that make an input of ``function``, each once."""
@@ -65,28 +65,10 @@ class BipartiteDigraph:
 
         Functions on a cycle, and those behind one, are left out.
         """
-        if self._is_in_order():
-            return tuple(self.inputs)
-        names = tuple(self.inputs)
-        position = {function: index for index, function in enumerate(names)}
-        producer, consumers, outputs = self.producer, self.consumers, self.outputs
-        waiting = [len(producer.keys() & tokens) for tokens in self.inputs.values()]
-        ready = [index for index, count in enumerate(waiting) if not count]
-        order: list[str] = []
-        while ready:
-            function = names[heapq.heappop(ready)]
-            order.append(function)
-            # In a faulty graph a token may have a second producer, or be made twice by one.
-            made = {token for token in outputs[function] if producer[token] == function}
-            for consumer in itertools.chain.from_iterable(consumers.get(token, ()) for token in made):
-                index = position[consumer]
-                waiting[index] -= 1
-                if not waiting[index]:
-                    heapq.heappush(ready, index)
-        return tuple(order)
+        return tuple(self.inputs) if self._is_defined_in_order() else self._sorted(self.inputs)
 
-    def _is_in_order(self) -> bool:
-        """Whether every function is defined after those that it needs, which is the usual case."""
+    def _is_defined_in_order(self) -> bool:
+        """Whether every function is defined after those that it needs: the usual case, which takes a tenth to see."""
         to_come = set(self.producer)
         for function, tokens in self.inputs.items():
             if not to_come.isdisjoint(tokens):
@@ -94,54 +76,56 @@ class BipartiteDigraph:
             to_come.difference_update(self.outputs[function])
         return True
 
+    def _sorted(self, functions: Iterable[str]) -> tuple[str, ...]:
+        """Sort some functions topologically, as if there were no others."""
+        position = {function: index for index, function in enumerate(functions)}
+        names = tuple(position)
+        waiting = [sum(maker in position for maker in self.predecessors(function)) for function in names]
+        ready = [index for index, count in enumerate(waiting) if not count]
+        order: list[str] = []
+        while ready:
+            function = names[heapq.heappop(ready)]
+            order.append(function)
+            for successor in self.successors(function):
+                if successor in position:
+                    index = position[successor]
+                    waiting[index] -= 1
+                    if not waiting[index]:
+                        heapq.heappush(ready, index)
+        return tuple(order)
+
     def shortest_cycle(self) -> tuple[str, ...]:
         """Return the vertices of a shortest cycle, tokens and functions in turn, beginning and ending with one token.
 
         Empty if there is none.
         """
         best: tuple[str, ...] = ()
-        suspects = self._on_cycles(set(self.inputs))
-        while suspects:
-            start = next(function for function in self.inputs if function in suspects)
+        suspects = dict.fromkeys(self.inputs)
+        while True:
+            for function in self._sorted(suspects):
+                del suspects[function]
+            if not suspects:
+                return self._with_tokens(best) if best else ()
+            start = next(iter(suspects))
             found = self._cycle_through(start, suspects, len(best))
-            if found and (not best or len(found) < len(best)):
-                best = found
-            # Every cycle through it has been looked at; what was on no other cycle goes with it.
-            suspects = self._on_cycles(suspects - {start})
-        return self._with_tokens(best) if best else ()
+            best = found or best
+            # Every cycle through it is known now. What was on no other cycle is sorted out with it.
+            del suspects[start]
 
-    def _on_cycles(self, functions: set[str]) -> set[str]:
-        """Drop the functions that nothing among the others leads to, or that lead to nothing, until none is left."""
-        kept = set(functions)
-        for neighbours, opposite in ((self.predecessors, self.successors), (self.successors, self.predecessors)):
-            count = {function: sum(other in kept for other in neighbours(function)) for function in kept}
-            ends = [function for function, left in count.items() if not left]
-            while ends:
-                gone = ends.pop()
-                kept.discard(gone)
-                for other in opposite(gone):
-                    if other in kept:
-                        count[other] -= 1
-                        if not count[other]:
-                            ends.append(other)
-        return kept
-
-    def _cycle_through(self, start: str, allowed: set[str], shorter_than: int) -> tuple[str, ...]:
-        """Search breadth-first for the shortest way from ``start`` back to itself."""
-        parent: dict[str, str] = {}
-        depth = {start: 0}
-        queue = deque([start])
-        while queue:
-            function = queue.popleft()
-            if shorter_than and depth[function] + 2 >= shorter_than:
+    def _cycle_through(self, start: str, allowed: Iterable[str], shorter_than: int) -> tuple[str, ...]:
+        """Search breadth-first for the shortest way from ``start`` back to itself; 0 is any length."""
+        to_visit = set(allowed) - {start}
+        pending: deque[tuple[str, ...]] = deque([(start,)])
+        while pending:
+            path = pending.popleft()
+            if shorter_than and len(path) + 1 >= shorter_than:
                 return ()
-            for successor in self.successors(function):
+            for successor in self.successors(path[-1]):
                 if successor == start:
-                    return _path(parent, start, function)
-                if successor in allowed and successor not in depth:
-                    depth[successor] = depth[function] + 1
-                    parent[successor] = function
-                    queue.append(successor)
+                    return (*path, start)
+                if successor in to_visit:
+                    to_visit.remove(successor)
+                    pending.append((*path, successor))
         return ()
 
     def _with_tokens(self, functions: tuple[str, ...]) -> tuple[str, ...]:
@@ -154,12 +138,3 @@ class BipartiteDigraph:
         for function, token in zip(functions[:-1], joints, strict=True):
             vertices += [function, token]
         return tuple(vertices)
-
-
-def _path(parent: Mapping[str, str], start: str, last: str) -> tuple[str, ...]:
-    path = [start]
-    while last != start:
-        path.append(last)
-        last = parent[last]
-    path.append(start)
-    return tuple(reversed(path))

@@ -1,31 +1,21 @@
-"""What is a computational graph, and what can be asked of it?"""
+"""The computational graph: functions joined by tokens."""
 
 from __future__ import annotations
 
+import inspect
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from types import FunctionType, MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.checks import (
-    check_arity,
-    check_cycle,
-    check_pairing,
-    check_producers,
-    check_results,
-    check_selectors,
-    is_single,
-    read_io,
-)
-from epypes.graph.contracts import check_colours, check_images, read_contracts
-from epypes.graph.declared import read_functions
-from epypes.graph.parts import Default, Parts, check_defaults, check_groups, groups_of
+from epypes.graph.identity import is_redefined_inside, redefined
 from epypes.graph.placeholder import is_placeholder
-from epypes.graph.redefined import is_redefined_inside, redefined
+from epypes.graph.signature import declared_outputs, positional_of, signature_of
 from epypes.graph.switch import as_switch
-from epypes.graph.typecheck import check_types
+from epypes.graph.token_annotations import read_contracts
+from epypes.graph.validation import Default, GraphParts, find_problems, read_io
 from epypes.images import Contracts
 from epypes.optional import optional_import
 from epypes.wording import counted
@@ -35,6 +25,8 @@ if TYPE_CHECKING:
 
 Tokens = str | tuple[str, ...] | list[str]
 FuncIO = Mapping[str, tuple[Tokens, Tokens | None]]
+
+_BY_HAND: Final = "name it in CompGraph(func_dict, func_io)"
 
 
 class CompGraph:
@@ -74,15 +66,10 @@ class CompGraph:
     <CompGraph: 1 function, 2 tokens; x -> y>
     """
 
-    __slots__ = (
-        "__weakref__", "_contracts", "_defaults", "_digraph", "_func_io", "_functions", "_groups", "_known",
-        "_placeholders", "_sinks", "_sources", "_switches", "_tokens", "_types",
-    )  # fmt: skip
-
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
         for what, given in (("func_dict", func_dict), ("func_io", func_io)):
             require_mapping(what, given, "by function name")
-        self._build(func_dict, func_io, (), [], {}, types)
+        self._build(GraphParts(dict(func_dict), dict(func_io), types=types))
 
     @classmethod
     def from_functions(cls, *functions: Callable[..., Any], types: bool = True) -> CompGraph:
@@ -113,68 +100,57 @@ class CompGraph:
         >>> cg, dict(cg.defaults)
         (<CompGraph: 2 functions, 4 tokens; image, threshold -> edges>, {'threshold': 70})
         """
-        return cls._assemble(read_functions(functions), types)
+        return cls._of(_read_functions(functions, types))
 
     @classmethod
-    def _assemble(cls, parts: Parts, types: bool) -> CompGraph:
+    def _of(cls, parts: GraphParts) -> Self:
         """Make a graph of parts, whose findings are reported with its own; for this package."""
         self = cls.__new__(cls)
-        self._build(parts.functions, parts.func_io, parts.defaults, parts.findings, parts.groups, types)
+        self._build(parts)
         return self
 
-    def _build(
-        self,
-        func_dict: Mapping[str, Callable[..., Any]],
-        func_io: FuncIO,
-        defaults: Iterable[Default],
-        found: Iterable[Finding],
-        groups: Mapping[str, str],
-        types: bool,
-    ) -> None:
-        findings = list(found)
-        digraph, written = read_io(func_io, findings)
-        findings += check_pairing(func_dict, func_io)
-        findings += check_producers(digraph)
+    def _build(self, parts: GraphParts) -> None:
+        findings = list(parts.findings)
+        digraph, func_io = read_io(parts.func_io, findings)
         order = digraph.run_order()
-        if len(order) < len(digraph.inputs):
-            findings += check_cycle(digraph)
-        findings += check_arity(func_dict, digraph)
-        contracts = read_contracts(func_dict, digraph)
-        findings += check_colours(contracts, digraph)
-        findings += check_selectors(func_dict, digraph)
-        findings += check_results(func_dict, digraph)
-        if types:
-            findings += check_types(func_dict, digraph, written)
-            findings += check_images(contracts, digraph)
-        kept = [default for default in defaults if _is_source(digraph, default.token)]
-        findings += check_defaults(kept)
-        findings += check_groups(func_dict, groups)
+        contracts = read_contracts(parts.functions, digraph)
+        findings += find_problems(parts, digraph, func_io, contracts, len(order) == len(digraph.inputs))
         if findings:
             raise GraphError(findings)
         if order != tuple(digraph.inputs):
             inputs, outputs = digraph.inputs, digraph.outputs
             digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
-            written = {name: written[name] for name in order}
-        self._digraph, self._types, self._contracts = digraph, types, contracts
-        self._functions = MappingProxyType({name: func_dict[name] for name in order})
-        self._func_io = MappingProxyType(written)
-        self._groups = MappingProxyType(_members(order, groups))
-        self._look_up()
-        values = {default.token: default.value for default in reversed(kept)}
-        self._defaults = MappingProxyType({token: values[token] for token in self._sources if token in values})
-
-    def _look_up(self) -> None:
-        """Note what is often asked for."""
-        digraph = self._digraph
-        sides = itertools.chain.from_iterable(zip(digraph.inputs.values(), digraph.outputs.values(), strict=True))
-        self._known = dict.fromkeys(itertools.chain.from_iterable(sides))
+        self._digraph, self._types = digraph, parts.types
+        self._contracts = MappingProxyType(contracts)
+        self._functions = MappingProxyType({name: parts.functions[name] for name in order})
+        self._func_io = MappingProxyType({name: func_io[name] for name in order})
+        self._known = digraph.tokens()
         self._tokens = tuple(self._known)
-        self._sources = tuple([token for token in self._tokens if token not in digraph.producer])
+        self._sources = tuple(token for token in self._tokens if token not in digraph.producer)
         taken = set(itertools.chain.from_iterable(digraph.inputs.values()))
-        self._sinks = tuple([token for token in self._tokens if token not in taken])
+        self._sinks = tuple(token for token in self._tokens if token not in taken)
         special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
         self._placeholders = tuple(name for name, function in special if is_placeholder(function))
-        self._switches = tuple(name for name, function in special if as_switch(function))
+        self._switches = tuple(name for name, function in special if as_switch(function) is not None)
+        defaults = {default.token: default.value for default in reversed(parts.defaults)}
+        self._defaults = MappingProxyType({token: defaults[token] for token in self._sources if token in defaults})
+        groups: dict[str, list[str]] = {}
+        for function in order:
+            if function in parts.groups:
+                groups.setdefault(parts.groups[function], []).append(function)
+        self._groups = MappingProxyType({name: tuple(functions) for name, functions in groups.items()})
+
+    def _parts(self) -> GraphParts:
+        """Return what the graph can be put together from again; for this package."""
+        group_of = {function: name for name, functions in self._groups.items() for function in functions}
+        consumers = self._digraph.consumers
+        return GraphParts(
+            dict(self._functions),
+            dict(self._func_io),
+            [Default(token, value, consumers[token][0]) for token, value in self._defaults.items()],
+            {function: group_of[function] for function in self._functions if function in group_of},
+            self._types,
+        )
 
     @property
     def functions(self) -> Mapping[str, Callable[..., Any]]:
@@ -233,8 +209,8 @@ class CompGraph:
 
     @property
     def contracts(self) -> Mapping[str, Contracts]:
-        """What annotations say of images, by function: a mark or None for each input, and for each output."""
-        return MappingProxyType(self._contracts)
+        """The marks of images in annotations, by function: a mark or None for each input, and for each output."""
+        return self._contracts
 
     def func_inputs(self, name: str) -> tuple[str, ...]:
         """Return the input tokens of a function."""
@@ -249,7 +225,7 @@ class CompGraph:
     def has_single_output(self, name: str) -> bool:
         """Whether the function's value is one token as it is, not a sequence of tokens."""
         self.require_function(name)
-        return is_single(self._func_io[name][1])
+        return isinstance(self._func_io[name][1], str)
 
     def has_token(self, name: str) -> bool:
         """Whether there is such a token."""
@@ -289,10 +265,10 @@ class CompGraph:
         return graph
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Give what a copy or a pickle is made of; functions are pickled by name."""
-        return _again, (dict(self._functions), dict(self._func_io), dict(self._defaults), self._types, groups_of(self))
+        """Give what a pickle is made of; functions are pickled by name."""
+        return type(self)._of, (self._parts(),)
 
-    def __deepcopy__(self, memo: object) -> CompGraph:
+    def __deepcopy__(self, memo: object) -> Self:
         """Return the graph itself, which does not change."""
         return self
 
@@ -309,24 +285,46 @@ class CompGraph:
         return mimebundle(self)
 
 
-def _again(
-    functions: dict[str, Any], func_io: dict[str, Any], defaults: dict[str, Any], types: bool, groups: dict[str, str]
-) -> CompGraph:
-    given = [Default(token, value, "") for token, value in defaults.items()]
-    return CompGraph._assemble(Parts(functions, func_io, given, groups=groups), types)
+def _read_functions(functions: Iterable[Any], types: bool) -> GraphParts:
+    """Read names, io and defaults of functions; what can't be read becomes a finding and is left out."""
+    parts = GraphParts(types=types)
+    for function in functions:
+        signature = _declaration(function, parts.functions)
+        if isinstance(signature, Finding):
+            parts.findings.append(signature)
+            continue
+        name, positional = function.__name__, positional_of(signature)
+        made = declared_outputs(function)
+        outputs: Any = name if made is None else made[0] if len(made) == 1 else made or None
+        parts.functions[name] = function
+        parts.func_io[name] = (tuple(parameter.name for parameter in positional), outputs)
+        given = [parameter for parameter in positional if parameter.default is not parameter.empty]
+        parts.defaults.extend(Default(parameter.name, parameter.default, name) for parameter in given)
+    return parts
 
 
-def _members(order: Iterable[str], groups: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
-    """Return the functions by group, both in run order."""
-    found: dict[str, list[str]] = {}
-    for function in order:
-        if function in groups:
-            found.setdefault(groups[function], []).append(function)
-    return {name: tuple(functions) for name, functions in found.items()}
-
-
-def _is_source(digraph: BipartiteDigraph, token: str) -> bool:
-    return token in digraph.consumers and token not in digraph.producer
+def _declaration(function: Any, taken: Container[str]) -> inspect.Signature | Finding:
+    """Return the signature of a function that has one and a name that is not taken, else what is wrong with it."""
+    if not callable(function):
+        text = f"{function!r:.60} is {type(function).__name__}, which can't be called. Give functions, one by one."
+        return Finding("not callable", text, ())
+    name = getattr(function, "__name__", None)
+    if not isinstance(name, str) or not name.isidentifier():
+        what = "A lambda" if name == "<lambda>" else f"{function!r:.60}"
+        text = f"{what} has no name that could be its token's. Write it as a function (def), or {_BY_HAND}."
+        return Finding("no name", text, ())
+    if name in taken:
+        return Finding(
+            "two functions", f"Two functions are called {name!r}. Rename one of them, or {_BY_HAND}.", (name,)
+        )
+    signature = signature_of(function)
+    if signature is None:
+        text = (
+            f"The parameters of {name!r} are not known, since it has no signature. "
+            f"Write a function (def) that calls it, or {_BY_HAND}."
+        )
+        return Finding("no signature", text, (name,))
+    return signature
 
 
 def _redefined_text(cg: CompGraph) -> str:

@@ -1,48 +1,15 @@
-"""What does a function's signature say about its inputs?
-
-A graph of 10,000 functions is checked in milliseconds, so what a plain function says is read from its code;
-``inspect.signature`` costs twenty times as much and is asked only where the code is not the whole truth.
-"""
+"""The signature of a function: the inputs that it takes, and the output tokens that ``@ep.outputs`` names."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from types import FunctionType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
-_POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-NO_DEFAULT: Final = inspect.Parameter.empty
+F = TypeVar("F", bound=Callable[..., Any])
 
-
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """What a function takes.
-
-    Attributes
-    ----------
-    positional
-        Names and defaults of the parameters that can be given by position; NO_DEFAULT where there is none.
-    variadic
-        Whether it takes any number more (``*args``).
-    required_by_keyword
-        The parameters that can't be given by position and have no default.
-    """
-
-    positional: tuple[tuple[str, Any], ...]
-    variadic: bool
-    required_by_keyword: tuple[str, ...]
-
-    @property
-    def least(self) -> int:
-        """The least number of positional inputs."""
-        return sum(default is NO_DEFAULT for _, default in self.positional)
-
-    @property
-    def most(self) -> float:
-        """The largest number of positional inputs; inf for ``*args``."""
-        return float("inf") if self.variadic else len(self.positional)
+_OUTPUTS: Final = "__epypes_outputs__"
 
 
 def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
@@ -53,46 +20,61 @@ def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
         return None
 
 
-def is_plain(function: object) -> bool:
-    """Whether this is a Python function or lambda whose code says all: no wrapper, no signature of its own."""
-    return type(function) is FunctionType and not (function.__dict__ and _speaks_for_another(function))
+def positional_of(signature: inspect.Signature) -> list[inspect.Parameter]:
+    """Return the parameters that can be given by position, but for ``*args``."""
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return [parameter for parameter in signature.parameters.values() if parameter.kind in kinds]
 
 
-def _speaks_for_another(function: FunctionType) -> bool:
-    return "__wrapped__" in function.__dict__ or "__signature__" in function.__dict__
+def distinct(functions: Mapping[str, Any]) -> dict[int, Any]:
+    """Return each function once, by its id: a large graph has few functions under many names."""
+    return {id(function): function for function in functions.values()}
 
 
-def parameters_of(function: Callable[..., Any]) -> Parameters | None:
-    """Return what a function takes, or None where that is not known."""
-    if isinstance(function, FunctionType) and is_plain(function):
-        return _from_code(function)
-    signature = signature_of(function)
-    return None if signature is None else _from_signature(signature)
+def plain_count(function: object) -> int | None:
+    """Return how many parameters a plain function has, all of which can be given by position; None for any other.
+
+    It is read from the code: ``inspect.signature`` takes 10 us, and a graph may have 10,000 functions.
+    """
+    if type(function) is not FunctionType or function.__code__.co_kwonlyargcount:
+        return None
+    is_plain = not function.__dict__ or function.__dict__.keys().isdisjoint(("__wrapped__", "__signature__"))
+    return function.__code__.co_argcount if is_plain else None
 
 
-def _from_code(function: FunctionType) -> Parameters:
-    code = function.__code__
-    count = code.co_argcount
-    names = code.co_varnames[:count]
-    defaults = function.__defaults__ or ()
-    filled = (*(NO_DEFAULT,) * (count - len(defaults)), *defaults)
-    given = function.__kwdefaults__ or {}
-    by_keyword = code.co_varnames[count : count + code.co_kwonlyargcount]
-    return Parameters(
-        tuple(zip(names, filled, strict=True)),
-        bool(code.co_flags & inspect.CO_VARARGS),
-        tuple(name for name in by_keyword if name not in given),
-    )
+def outputs(*names: str) -> Callable[[F], F]:
+    """Name the output tokens of a function, for ``CompGraph.from_functions``.
+
+    One name takes the value as it is, n names a sequence of n values; without a name there is no output.
+
+    Examples
+    --------
+    >>> @outputs("keypoints", "descriptors")
+    ... def detect(image):
+    ...     return [], None
+    """
+    for name in names:
+        if not isinstance(name, str) or not name:
+            text = f"outputs() takes the names of tokens, not {name!r}."
+            raise TypeError(text + ' Write @ep.outputs("a", "b") above the function.' * callable(name))
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"outputs() names {', '.join(map(repr, twice))} twice. Every output is a token of its own.")
+
+    def mark(function: F) -> F:
+        try:
+            setattr(function, _OUTPUTS, names)
+        except (AttributeError, TypeError) as error:
+            name = getattr(function, "__name__", function)
+            raise TypeError(
+                f"{name!r} can't be marked. Write a function (def) that calls it, and mark that."
+            ) from error
+        return function
+
+    return mark
 
 
-def _from_signature(signature: inspect.Signature) -> Parameters:
-    parameters = signature.parameters.values()
-    return Parameters(
-        tuple((parameter.name, parameter.default) for parameter in parameters if parameter.kind in _POSITIONAL),
-        any(parameter.kind is inspect.Parameter.VAR_POSITIONAL for parameter in parameters),
-        tuple(
-            parameter.name
-            for parameter in parameters
-            if parameter.kind is inspect.Parameter.KEYWORD_ONLY and parameter.default is NO_DEFAULT
-        ),
-    )
+def declared_outputs(function: object) -> tuple[str, ...] | None:
+    """Return the names given to ``outputs``, None if it was not used."""
+    found = getattr(function, _OUTPUTS, None)
+    return found if isinstance(found, tuple) else None

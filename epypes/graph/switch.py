@@ -1,14 +1,13 @@
-"""Which of several branches of a graph does a hyperparameter choose?"""
+"""Switches: functions that choose one of several branches of a graph by a hyperparameter."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Hashable, Mapping
-from numbers import Number
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import UnknownName, require_mapping
-from epypes.graph.placeholder import innermost
+from epypes.graph.identity import innermost
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
@@ -24,11 +23,6 @@ class Switch:
     branches
         The keys of the branches, in the order of the inputs.
 
-    Raises
-    ------
-    ValueError
-        A key is NaN, or a tuple with NaN in it.
-
     Attributes
     ----------
     branches
@@ -36,10 +30,6 @@ class Switch:
     """
 
     def __init__(self, name: str, branches: tuple[Hashable, ...]) -> None:
-        for key in branches:
-            if _is_nan(key):
-                text = f"Switch {name!r} has a branch for NaN, which equals nothing, not even itself."
-                raise ValueError(f"{text} Choose by strings, or by None.")
         self.name, self.branches = name, branches
         self._index = {key: index for index, key in enumerate(branches)}
         # The graph checks the number of inputs against it.
@@ -67,13 +57,6 @@ class Switch:
 
     def __repr__(self) -> str:
         return f"<Switch {self.name!r:.40}: {len(self.branches)} branches>"
-
-
-def _is_nan(key: Any) -> bool:
-    """Whether a key would be found again only as the same object."""
-    if isinstance(key, tuple | frozenset):
-        return any(map(_is_nan, key))
-    return isinstance(key, Number) and bool(key != key)
 
 
 def as_switch(function: object) -> Switch | None:
@@ -104,7 +87,7 @@ def switch(name: str, branches: Mapping[Any, str], by: str, output: str) -> Comp
     TypeError
         The branches are no mapping, or the output is not one token.
     ValueError
-        There is no branch, or one for NaN.
+        There is no branch.
     GraphError
         A name is no name of a token.
 

@@ -1,14 +1,10 @@
 """The paper's ladder: Node, Pipeline, and the pipelines that answer events."""
 
-from epypes.pipeline.loop import EventLoop
+from epypes.pipeline.event_loop import EventLoop
 from epypes.pipeline.mailbox import Mailbox
-from epypes.pipeline.network import NodeBasedCompGraph
-from epypes.pipeline.node import Node
-from epypes.pipeline.pipeline import Pipeline
-from epypes.pipeline.reactive import FullPipeline, SinkPipeline, SourcePipeline
-from epypes.pipeline.stages import Stage, Stages
-from epypes.pipeline.stamps import Stamps
-from epypes.pipeline.view import EventView
+from epypes.pipeline.node import Node, NodeBasedCompGraph
+from epypes.pipeline.pipeline import Pipeline, Stage, Stages
+from epypes.pipeline.reactive import EventView, FullPipeline, SinkPipeline, SourcePipeline, Stamps
 
 __all__ = [
     "EventLoop",

@@ -10,8 +10,7 @@ from time import monotonic
 from typing import Any, Final, Literal, get_args
 
 from epypes.errors import MailboxOverflow
-from epypes.pipeline.log import log_error
-from epypes.pipeline.settling import reject
+from epypes.pipeline.event_loop import log_error, reject
 
 Policy = Literal["latest", "drop_oldest", "block", "fault"]
 _POLICIES: Final = get_args(Policy)
@@ -84,18 +83,18 @@ class Mailbox:
     def hand_to(self, take: Callable[[Any], object], /) -> Callable[[], None]:
         """Have each item handed over within `put`, on the thread that puts, instead of kept; return what ends that.
 
-        So nobody has to wait in `get`, and no thread has to be woken up: what a ZMQPublisher takes has been sent when
+        So no thread has to wait in `get`, and none has to be woken up: what a ZMQPublisher takes has been sent when
         ``put`` returns. What is kept already is handed over first, and then ``take`` must not raise; later what it
         raises comes out of ``put``. It must let several threads call it at once.
 
         Raises
         ------
         ValueError
-            Its items are handed to somebody else already.
+            Its items are handed to another taker already.
         """
         with self._changed:
             if self._take is not None:
-                raise ValueError("The items of this mailbox are handed to somebody else. Give each publisher its own.")
+                raise ValueError("The items of this mailbox are handed to another taker. Give each publisher its own.")
             while self._items:
                 take(self._items.popleft())
             self._take = take
@@ -109,7 +108,7 @@ class Mailbox:
         return end
 
     def _keep(self, item: Any, block: bool, timeout: float | None) -> Callable[[Any], object] | None:
-        """Keep an item until somebody gets it, or return whom it must be handed to, since this has begun meanwhile."""
+        """Keep an item until it is taken; return the taker that it must be handed to, if one has come meanwhile."""
         _require_timeout(block, timeout)
         with self._changed:
             dropped: list[Any] = []

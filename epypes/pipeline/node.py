@@ -1,31 +1,21 @@
-"""A function at run time."""
+"""A function at run time, and the network of them that a graph becomes."""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from time import perf_counter_ns
-from types import CodeType
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, cast
+from weakref import ref
 
+from epypes.graph import CompGraph
 from epypes.run.guard import WATCH, called_for
-from epypes.run.underway import functions_under_way, locals_under_way
 
-M = TypeVar("M", bound=Callable[..., Any])
-
-_CALLS: Final[set[CodeType]] = set()
-
-
-def is_a_call(method: M) -> M:
-    """Mark a method of nodes: as long as it has not returned, its node is running."""
-    _CALLS.add(method.__code__)
-    return method
-
-
-def under_way() -> list[object]:
-    """Return the nodes that have been called and have not returned, in any thread, and the functions of graphs."""
-    return [*functions_under_way(), *(found["self"] for found in locals_under_way(_CALLS))]
+if TYPE_CHECKING:
+    from epypes.graph.validation import GraphParts
+    from epypes.run.program import Program
 
 
 class Node:
@@ -39,13 +29,6 @@ class Node:
         Its name in graphs and reports.
     func
         What it computes.
-
-    Attributes
-    ----------
-    duration_ns
-        How long the last call took, in nanoseconds; 0 before the first.
-    run_count
-        How often it was called, failed calls included.
 
     Notes
     -----
@@ -63,10 +46,12 @@ class Node:
             raise TypeError(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
         self.name = name
         self.func = called_for(name, func)
-        self.duration_ns = 0
-        self.run_count = 0
+        # Nanoseconds of the last call, and how many there were.
+        self._called = [0, 0]
         # Whole in every thread, which counting up is not.
-        self.next_count = itertools.count(1).__next__
+        self._next_count = itertools.count(1).__next__
+        # Those that call ``func`` in the node's place; they know of calls that are not counted yet.
+        self.programs: list[ref[Program]] = []
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func, updated=())
         # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
@@ -75,16 +60,35 @@ class Node:
         }
         self.__dict__.update(marks)
 
-    @is_a_call
     def __call__(self, *args: Any) -> Any:
         """Compute, and measure the time."""
         start_ns = perf_counter_ns()
         try:
             return self.compute(*args)
         finally:
-            # What calls ``func`` in its place does these two as well.
-            self.duration_ns = perf_counter_ns() - start_ns
-            self.run_count = self.next_count()
+            self.count_call(perf_counter_ns() - start_ns)
+
+    def count_call(self, duration_ns: int) -> None:
+        """Take note of a call."""
+        self._called = [duration_ns, self._next_count()]
+
+    @property
+    def duration_ns(self) -> int:
+        """How long the last call took, in nanoseconds; 0 before the first."""
+        self._count_runs()
+        return self._called[0]
+
+    @property
+    def run_count(self) -> int:
+        """How often the node was called, failed calls included."""
+        self._count_runs()
+        return self._called[1]
+
+    def _count_runs(self) -> None:
+        for found in tuple(self.programs):
+            program = found()
+            if program is not None:
+                program.count_calls()
 
     @property
     def time(self) -> float:
@@ -97,14 +101,9 @@ class Node:
 
     @property
     def __epypes_is_its_func__(self) -> bool:
-        """Whether it comes to the same to call ``func``, set ``duration_ns`` and count the call."""
+        """Whether it comes to the same to call ``func``, and to count the call later."""
         kind = type(self)
         return kind.__call__ is Node.__call__ and kind.compute is Node.compute and "compute" not in vars(self)
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a call has not returned yet."""
-        return any(node is self for node in under_way())
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call)``; a pipeline adds its nodes' tuples as a third item."""
@@ -112,3 +111,50 @@ class Node:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__:.30} {self.name!r:.40}: {self.run_count} calls>"
+
+
+class NodeBasedCompGraph(CompGraph):
+    """The network of Nodes of a graph: the same graph with a Node in place of each function.
+
+    Functions that are Nodes already (a Pipeline, a subclass) are kept. It is drawn and run as any graph. What
+    ``ep.union`` and the other operations make of it is a CompGraph whose functions are these Nodes.
+
+    Parameters
+    ----------
+    cg
+        The graph; it stays as it is.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Nodes and pipelines".
+
+    Examples
+    --------
+    >>> network = NodeBasedCompGraph(CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")}))
+    >>> network.nodes["double"](21), network.sink_tokens
+    (42, ('y',))
+    """
+
+    def __init__(self, cg: CompGraph) -> None:
+        if not isinstance(cg, CompGraph):
+            raise TypeError(f"A NodeBasedCompGraph is made of a CompGraph, not {type(cg).__name__!r}.")
+        self._build(cg._parts())
+
+    def _build(self, parts: GraphParts) -> None:
+        nodes: dict[str, Callable[..., Any]] = {
+            name: function if isinstance(function, Node) or not callable(function) else Node(name, function)
+            for name, function in parts.functions.items()
+        }
+        super()._build(replace(parts, functions=nodes))
+
+    @property
+    def nodes(self) -> Mapping[str, Node]:
+        """The nodes by function name, in run order."""
+        return cast("Mapping[str, Node]", self.functions)
+
+    def traverse_time(self) -> tuple[Any, ...]:
+        """Return the nodes' ``traverse_time()``, in run order."""
+        return tuple(node.traverse_time() for node in self.nodes.values())
+
+    def __repr__(self) -> str:
+        return f"<NodeBasedCompGraph: {len(self.nodes)} nodes>"

@@ -4,23 +4,55 @@ from __future__ import annotations
 
 import inspect
 import keyword
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Literal
 
 from epypes.errors import HyperparameterError, PayloadError
-from epypes.graph import CompGraph
-from epypes.graph.hinted import annotated_params
+from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
-from epypes.pipeline.network import NodeBasedCompGraph
-from epypes.pipeline.node import Node, is_a_call
-from epypes.pipeline.stages import Stages
+from epypes.pipeline.node import Node, NodeBasedCompGraph
 from epypes.run import CompGraphRunner, Run
 from epypes.wording import counted
 
+StageKind = Literal["queue", "loop", "function"]
+StageState = Literal["static", "running", "stopped", "failed"]
 
-class Pipeline(Node):
-    """A Node that runs a graph.
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage of a reactive pipeline, outside its graph, at one moment.
+
+    Attributes
+    ----------
+    kind
+        What it is: a queue, an event loop, or a function such as f_in.
+    name
+        Such as ``"q_in"``.
+    state
+        ``"running"``: of a loop that it listens, of a function that an event is in it, of a queue that an answer
+        waits to be put on it; ``"failed"``: of a function that the last event failed in it.
+    notes
+        Short lines: what it is, its counts.
+    """
+
+    kind: StageKind
+    name: str
+    state: StageState = "static"
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """The stages that an event passes before and after the graph, in that order."""
+
+    before: tuple[Stage, ...] = ()
+    after: tuple[Stage, ...] = ()
+
+
+class Pipeline(Node, Mapping[str, Any]):
+    """A Node that runs a graph; a mapping of its runner's tokens, as a CompGraphRunner is.
 
     Called with the free source tokens in order of first appearance in func_io, it returns its sink token, or a
     tuple of them in graph order: so it can be a function of another graph.
@@ -53,7 +85,7 @@ class Pipeline(Node):
             way_out = "Give its graph: .cg" if isinstance(getattr(cg, "cg", None), CompGraph) else "Pipeline(name, cg)"
             raise TypeError(f"A pipeline runs a CompGraph, not {type(cg).__name__!r}. {way_out}.")
         self.network = NodeBasedCompGraph(cg)
-        self.runner = CompGraphRunner(self.network.cg, hparams, workers=workers)
+        self.runner = CompGraphRunner(self.network, hparams, workers=workers)
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
         super().__init__(name, self.__call__)
@@ -85,20 +117,18 @@ class Pipeline(Node):
         """What an event passes before and after the graph, as it is at this moment; the hook for subclasses."""
         return Stages()
 
-    @is_a_call
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
-        # To free the tokens of the run before takes its time, which is not this run's.
-        before = self.runner.last
         start_ns = perf_counter_ns()
+        # In place before the run, whose functions fill the caches: after it each look-up takes a microsecond.
+        self._called = called = [*self._called]
+        count = self._next_count()
         try:
             run: Run = self.compute(payload)
             return run
         finally:
-            self.duration_ns = perf_counter_ns() - start_ns
-            self.run_count = self.next_count()
-            # Not at the end of this frame, which a failure keeps.
-            del before
+            called[1] = count
+            called[0] = perf_counter_ns() - start_ns
 
     def __call__(self, *args: Any) -> Any:
         """Run the graph on the free source tokens, in order; return its sink token or tokens."""
@@ -111,6 +141,24 @@ class Pipeline(Node):
         (payload,) = args
         return self.runner.run_on(payload)
 
+    # What an EventLoop asks of its pipeline.
+
+    def _react(self, event: Any, f_in: Callable[[Any], Mapping[str, Any]] | None) -> None:
+        """Run for an event; without f_in it is the only input."""
+        if f_in is None:
+            self(event)
+        else:
+            self.run(**f_in(event))
+
+    def _has_settled(self, event: Any) -> bool:
+        """Whether the pipeline has acknowledged or rejected the event itself."""
+        return False
+
+    @property
+    def _busy(self) -> tuple[str, ...]:
+        """What has not returned, for errors: functions of the graph."""
+        return self.runner.running
+
     def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
         free = self.runner.free_source_tokens
         if len(args) != len(free):
@@ -121,6 +169,22 @@ class Pipeline(Node):
 
     def __getitem__(self, token: str) -> Any:
         return self.runner[token]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.runner)
+
+    def __len__(self) -> int:
+        return len(self.runner)
+
+    def __bool__(self) -> bool:
+        """Whether there is a pipeline: true also before its first run, as of any other function."""
+        return True
+
+    # Values may be arrays, and a pipeline changes: pipelines are told apart by identity.
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     def __setitem__(self, token: str, value: Any) -> None:
         self.runner[token] = value
@@ -170,9 +234,10 @@ class Pipeline(Node):
         report = None if last is None else last.report
         if report is not None and report.side_by_side:
             return report.overhead_ns / 1e9
-        # This is asked of every event, where the whole graph ran, and entries by function take their time to make.
-        counted = nodes.values() if report is not None and report.is_whole else map(nodes.__getitem__, self._counted())
-        return (self.duration_ns - sum(node.duration_ns for node in counted)) / 1e9
+        if report is not None and report.is_whole and len(report.program.nodes) == len(nodes):
+            # The nodes' times, which take longer to look up one by one.
+            return (self.duration_ns - sum(report.ran_ns.values())) / 1e9
+        return (self.duration_ns - sum(nodes[function].duration_ns for function in self._counted())) / 1e9
 
     def _counted(self) -> Collection[str]:
         """Return the functions that took part in the last call."""

@@ -1,36 +1,201 @@
 """Pipelines that answer events.
 
 The paper's reactive pipelines: a SourcePipeline puts what it computes on q_out, a SinkPipeline is driven by q_in,
-a FullPipeline does both.
+a FullPipeline does both. While an event is worked on, its `EventView` says how far it has come.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import contextlib
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from time import perf_counter_ns
-from typing import Any, Literal, Self
+from threading import get_ident
+from time import perf_counter_ns, time_ns
+from typing import Any, Final, Self
 
 from epypes.errors import EpypesError
 from epypes.graph import CompGraph
-from epypes.pipeline.answering import Answering, FOut, OfThread
-from epypes.pipeline.attempts import Attempts, event_id
-from epypes.pipeline.log import log_error
-from epypes.pipeline.loop import EventLoop
-from epypes.pipeline.pipeline import Pipeline
-from epypes.pipeline.settling import settle
-from epypes.pipeline.stages import Stages, function_stage, loop_stage, queue_stage
-from epypes.pipeline.stamps import Stamps
-from epypes.run import Failure, Run
-from epypes.run.raised import run_that_raised
-from epypes.run.underway import locals_under_way
+from epypes.pipeline.event_loop import EventLoop, is_kept, log_error, settle
+from epypes.pipeline.mailbox import Mailbox
+from epypes.pipeline.pipeline import Pipeline, Stage, Stages, StageState
+from epypes.run import Failure, Run, RunReport
+from epypes.wording import counted
 
 FIn = Callable[[Any], Mapping[str, Any]]
-# What an event is in: its f_in, its graph, or its f_out with the put on q_out.
-Where = Literal["f_in", "graph", "f_out"]
+FOut = Callable[["EventView"], Any]
+
+# Ids of events that failed: some for every event that may be sent again.
+_MAX_REMEMBERED: Final = 1_000
 
 
-class SourcePipeline(Answering, Pipeline):
+class Stamps:
+    """The times of one event, in nanoseconds of Unix time; 0 until they are known.
+
+    They are read from one monotonic clock, which is set by the system's clock once per event: so their differences hold
+    whatever the system's clock does meanwhile.
+    """
+
+    __slots__ = ("_view",)
+
+    def __init__(self, view: EventView) -> None:
+        self._view = view
+
+    @property
+    def react_ns(self) -> int:
+        """When the event was taken from q_in; of a SourcePipeline when the run began."""
+        return self._view.unix_ns(self._view.react)
+
+    @property
+    def f_in_start_ns(self) -> int:
+        """When f_in was called."""
+        return self._view.unix_ns(self._view.react if self._view.f_in_end else 0)
+
+    @property
+    def f_in_end_ns(self) -> int:
+        """When f_in had returned."""
+        return self._view.unix_ns(self._view.f_in_end)
+
+    @property
+    def f_out_start_ns(self) -> int:
+        """When f_out was called."""
+        return self._view.unix_ns(self._view.f_out_start)
+
+    @property
+    def f_out_end_ns(self) -> int:
+        """When f_out had returned."""
+        return self._view.unix_ns(self._view.f_out_end)
+
+    def now_ns(self) -> int:
+        """Return the time at this moment, by the event's clock."""
+        return self._view.now_ns()
+
+    def __repr__(self) -> str:
+        names = ("f_in_start", "f_in_end", "f_out_start", "f_out_end")
+        known = [name for name in names if getattr(self, f"{name}_ns")]
+        return f"<Stamps of an event: {', '.join(known) or 'just taken'}>"
+
+
+class EventView(Mapping[str, Any]):
+    """One event's run of a pipeline: what f_out is given, never shared with another event.
+
+    Reads like the pipeline: ``view["edges"]``, ``view.attributes``, ``view.traverse_time()``.
+
+    Attributes
+    ----------
+    event
+        What was taken from q_in; None for a SourcePipeline.
+    run
+        The event's run.
+    attributes
+        A shallow copy of the pipeline's attributes: the mapping is this event's own, the values are the pipeline's.
+    stage
+        Where the event is: ``"f_in"``, ``"graph"``, ``"f_out"``, ``"q_out"``; empty when it is over.
+    react, f_in_end, f_out_start, f_out_end
+        Readings of ``perf_counter_ns``; 0 until they are known. ``stamps`` has them as Unix times.
+    """
+
+    # Unix times are made of the readings when they are asked for: most events are never asked.
+    __slots__ = (
+        "_offset_ns", "attributes", "event", "f_in_end", "f_out_end", "f_out_start", "name", "react", "run", "stage",
+    )  # fmt: skip
+    run: Run
+    attributes: dict[str, Any]
+
+    def __init__(self, name: str, event: Any, stage: str = "f_in") -> None:
+        self.react = perf_counter_ns()
+        self.name, self.event, self.stage = name, event, stage
+        self.f_in_end = self.f_out_start = self.f_out_end = self._offset_ns = 0
+
+    @classmethod
+    def of_run(cls, name: str, event: Any, run: Run, attributes: Mapping[str, Any]) -> EventView:
+        """Return the view of a run that has been made for an event."""
+        view = cls(name, event, "f_out")
+        view.run, view.attributes = run, dict(attributes)
+        return view
+
+    @property
+    def stamps(self) -> Stamps:
+        """When the event was taken, and when f_in and f_out worked on it."""
+        return Stamps(self)
+
+    def unix_ns(self, reading_ns: int) -> int:
+        """Return a reading of ``perf_counter_ns`` as Unix time; 0 for 0."""
+        if not self._offset_ns:
+            self._offset_ns = time_ns() - perf_counter_ns()
+        return reading_ns and self._offset_ns + reading_ns
+
+    def now_ns(self) -> int:
+        """Return the time at this moment, by the event's clock: nanoseconds of Unix time."""
+        return (self._offset_ns or self.unix_ns(1) - 1) + perf_counter_ns()
+
+    @property
+    def report(self) -> RunReport:
+        """The times of the event's run."""
+        return self.run.report
+
+    @property
+    def time(self) -> float:
+        """How long the event's run took, in seconds."""
+        return self.report.total_ns / 1e9
+
+    def traverse_time(self) -> tuple[Any, ...]:
+        """Return ``(name, seconds, ((function, seconds), ...))`` of the event's own run."""
+        nodes = tuple((entry.function, entry.duration_ns / 1e9) for entry in self.report.functions)
+        return self.name, self.time, nodes
+
+    def compute_overhead(self) -> float:
+        """Return the graph overhead of the event's run, in seconds."""
+        return self.report.overhead_ns / 1e9
+
+    def __getitem__(self, token: str) -> Any:
+        return self.run[token]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.run)
+
+    def __len__(self) -> int:
+        return len(self.run)
+
+    def __repr__(self) -> str:
+        return f"<EventView of {self.name!r:.40}: {len(self)} tokens>"
+
+
+class _Answering(Pipeline):
+    """What SourcePipeline and FullPipeline have in common: they put ``f_out(view)`` on ``q_out``."""
+
+    q_out: Any
+    f_out: FOut
+    # The events under way, by the thread that works on them.
+    _events: dict[int, EventView]
+
+    def emit(self, event: Any, run: Run) -> None:
+        """Put what f_out makes of the event's run on q_out. The hook for subclasses."""
+        view = self._events.get(get_ident())
+        if view is None or view.event is not event:
+            view = EventView(self.name, event, "f_out")
+        view.run, view.attributes = run, dict(self.attributes)
+        view.f_out_start = perf_counter_ns()
+        answer = self.f_out(view)
+        view.f_out_end = perf_counter_ns()
+        view.stage = "q_out"
+        self.put(answer, view)
+
+    def put(self, answer: Any, view: EventView) -> None:
+        """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
+        self.q_out.put(answer)
+
+    def _stages_after(self, failure: str) -> tuple[Stage, Stage]:
+        """Return f_out and q_out as they are at this moment; ``failure`` is what f_out raised for the last event."""
+        where = _where(self._events)
+        return (
+            _function_stage("f_out", self.f_out, is_running="f_out" in where, failure=failure),
+            queue_stage("q_out", self.q_out, is_waited_for="q_out" in where),
+        )
+
+
+class SourcePipeline(_Answering):
     """A Pipeline that puts ``f_out(view)`` on ``q_out`` after every run.
 
     Parameters
@@ -53,15 +218,18 @@ class SourcePipeline(Answering, Pipeline):
     ) -> None:
         super().__init__(name, cg, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
-        self._own = OfThread()
+        self._events = {}
 
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload and put the result on q_out."""
-        stamps = Stamps()
+        view = EventView(self.name, None, "f_out")
         run = super().run(**payload)
         # Only now: the graph may run this pipeline itself, on this thread.
-        self._own.stamps = stamps
-        self.emit(None, run)
+        self._events[get_ident()] = view
+        try:
+            self.emit(None, run)
+        finally:
+            self._events.pop(get_ident(), None)
         return run
 
     @property
@@ -90,9 +258,11 @@ class SinkPipeline(Pipeline):
         failures are logged. The loop goes on.
     failed
         How many events failed.
-    working_on
-        The event under way; None between events.
     """
+
+    f_out: Any
+    # Whether `handle` puts the answer of f_out on q_out itself, which takes a call less than `emit`.
+    _has_usual_emit = False
 
     def __init__(
         self,
@@ -108,39 +278,65 @@ class SinkPipeline(Pipeline):
         self.q_in, self.f_in = q_in, f_in
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
-        self.working_on: Any = None
-        self._attempts = Attempts()
+        self._events: dict[int, EventView] = {}
+        self._attempts = _Attempts()
         # Where the last event that failed did so, what was raised, and how many had been worked on.
-        self._failed_last: tuple[Where | None, str, int] = (None, "", 0)
-        self._own = OfThread()
-        self.loop = EventLoop(q_in, self.handle, name=name, busy=self._busy, settle=self._settle_if_not_yet)
+        self._failed_last: tuple[str, str, int] = ("", "", 0)
+        # By thread, the f_in of its loop, if that has its own.
+        self._f_ins: dict[int, FIn] = {}
+        # The event that `handle` has settled last on each thread.
+        self._settled = threading.local()
+        self.loop = EventLoop(q_in, self)
+
+    def _react(self, event: Any, f_in: FIn | None) -> None:
+        if f_in is None:
+            self.handle(event)
+            return
+        self._f_ins[get_ident()] = f_in
+        try:
+            self.handle(event)
+        finally:
+            del self._f_ins[get_ident()]
+
+    @property
+    def working_on(self) -> Any:
+        """The event under way; None between events."""
+        return next((view.event for view in tuple(self._events.values())), None)
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
+        view, thread = EventView(self.name, event), get_ident()
+        self._events[thread] = view
+        f_in = self._f_ins.get(thread, self.f_in) if self._f_ins else self.f_in
+        # Looked up now: a function of the graph fills the caches with its image, and each look-up takes microseconds.
+        clock, f_out, put = perf_counter_ns, self.f_out if self._has_usual_emit else None, self.put
         # To free the tokens of the run before takes its time: that is done when the answer is on its way.
         before = self.runner.last
-        self.working_on = event
         run: Run | None = None
-        # The stages look at it, in this frame.
-        where: Where | None = "f_in"
-        self._own.stamps = stamps = Stamps()
         try:
-            stamps.f_in_start = stamps.react
-            payload = self.f_in(event)
-            stamps.f_in_end = perf_counter_ns()
+            payload = f_in(event)
+            view.f_in_end = perf_counter_ns()
             if type(payload) is not dict:
                 self._require_mapping(payload)
-            where = "graph"
+            view.stage = "graph"
             run = self.run(**payload)
-            where = "f_out"
-            self.emit(event, run)
-            where = None
+            view.stage = "f_out"
+            if f_out is None:
+                self.emit(event, run)
+            else:
+                view.run, view.attributes = run, self.attributes.copy()
+                view.f_out_start = clock()
+                answer = f_out(view)
+                view.f_out_end = clock()
+                view.stage = "q_out"
+                put(answer, view)
+            view.stage = ""
         except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
-            failed_in, where = where, None
-            self._fail(event, failed_in, exception, run)
+            self._fail(view, exception, run)
         else:
-            self._settle(event)
-        self.working_on = None
+            if getattr(type(event), "ack", None) is not None:  # is_kept
+                self._settle(event)
+        self._events.pop(thread, None)
         del before
 
     def _require_mapping(self, payload: Any) -> None:
@@ -148,14 +344,11 @@ class SinkPipeline(Pipeline):
             text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
             raise TypeError(text)
 
+    @property
     def _busy(self) -> tuple[str, ...]:
-        """Return what has not returned: functions of the graph, or f_in, or f_out with its put on q_out."""
-        return self.network.running or tuple(where for where in self._under_way() if where != "graph")
-
-    def _under_way(self) -> list[Where]:
-        """Return what the events under way are in: one, unless handle is called by others than the loop too."""
-        calls = locals_under_way({SinkPipeline.handle.__code__})
-        return [found["where"] for found in calls if found["self"] is self and found.get("where")]
+        """What has not returned, for errors: functions of the graph, or f_in, or f_out, or the put on q_out."""
+        where = [stage for stage in _where(self._events) if stage != "graph"]
+        return self.runner.running or tuple("put on q_out" if stage == "q_out" else stage for stage in where)
 
     @property
     def stages(self) -> Stages:
@@ -163,14 +356,17 @@ class SinkPipeline(Pipeline):
         return Stages(
             before=(
                 queue_stage("q_in", self.q_in),
-                loop_stage(self.loop, self.failed),
-                function_stage(
-                    "f_in", self.f_in, is_under_way="f_in" in self._under_way(), failure=self._failure_in("f_in")
+                _loop_stage(self.loop, self.failed),
+                _function_stage(
+                    "f_in",
+                    self.f_in,
+                    is_running="f_in" in _where(self._events),
+                    failure=self._failure_in("f_in"),
                 ),
             )
         )
 
-    def _failure_in(self, where: Where) -> str:
+    def _failure_in(self, where: str) -> str:
         """Return what f_in or f_out raised for the last event; empty if none did, or that was another event."""
         failed_in, message, count = self._failed_last
         return message if failed_in == where and count == self.run_count else ""
@@ -178,34 +374,36 @@ class SinkPipeline(Pipeline):
     def emit(self, event: Any, run: Run) -> None:
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
 
-    def _fail(self, event: Any, where: Where | None, exception: BaseException, run: Run | None) -> None:
+    def put(self, answer: Any, view: EventView) -> None:
+        """Put an answer on q_out; a SinkPipeline has none. The hook for subclasses."""
+
+    def _fail(self, view: EventView, exception: BaseException, run: Run | None) -> None:
+        event, where = view.event, "f_out" if view.stage == "q_out" else view.stage
+        view.stage = ""
         self.failed += 1
         try:
             where, failure = self._failure_of(event, where, exception, run)
-        except BaseException:  # whatever a run of one's own does, the failure is told
-            failure = Failure(where or "compute", (), {"event": event}, exception)
+        except BaseException:  # whatever a run of one's own does, the failure is reported
+            failure = Failure(where, (), {"event": event}, exception)
         # The text alone: the exception would keep the event and all its tokens.
         self._failed_last = where, f"{failure.kind}: {failure.message}", self.run_count
         failed_id = event_id(event)
         self._report(replace(failure, event_id=failed_id, attempt=self._attempts.count(failed_id), source=self.name))
-        # When it has been told: whoever keeps the event may have nothing else to do with it.
-        self._settle(event, exception, str(failure))
+        # When it has been reported: a broker may have nothing else to do with the event.
+        if is_kept(event):
+            self._settle(event, exception, str(failure))
 
     def _settle(self, event: Any, exception: BaseException | None = None, text: str = "") -> None:
-        self._own.settled = event
+        self._settled.event = event
         settle(event, exception, text)
 
-    def _settle_if_not_yet(self, event: Any, exception: BaseException | None) -> None:
-        """Settle an event of the loop, unless `handle` has: that of a subclass need not call this one's."""
-        settled, self._own.settled = self._own.settled, None
-        if settled is not event:
-            settle(event, exception)
+    def _has_settled(self, event: Any) -> bool:
+        """Whether ``handle`` has settled the event: that of a subclass need not call this one's."""
+        return vars(self._settled).pop("event", None) is event
 
-    def _failure_of(
-        self, event: Any, where: Where | None, exception: BaseException, run: Run | None
-    ) -> tuple[Where | None, Failure]:
+    def _failure_of(self, event: Any, where: str, exception: BaseException, run: Run | None) -> tuple[str, Failure]:
         """Return what failed, and where."""
-        failed = run_that_raised(exception, self.runner) if where == "graph" else None
+        failed = self.runner.failed_run(exception) if where == "graph" else None
         if failed is not None and failed.failure is not None:
             return where, failed.failure
         if run is not None:
@@ -253,7 +451,7 @@ class SinkPipeline(Pipeline):
         self.stop()
 
 
-class FullPipeline(Answering, SinkPipeline):
+class FullPipeline(_Answering, SinkPipeline):
     """A Pipeline that runs for every event on ``q_in`` and puts ``f_out(view)`` on ``q_out``.
 
     Parameters
@@ -300,12 +498,101 @@ class FullPipeline(Answering, SinkPipeline):
     ) -> None:
         super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
-
-    def _busy(self) -> tuple[str, ...]:
-        """Return what has not returned, and tell f_out from the put of its answer."""
-        return tuple("put on q_out" if name == "f_out" and self._is_putting() else name for name in super()._busy())
+        self._has_usual_emit = type(self).emit is FullPipeline.emit
 
     @property
     def stages(self) -> Stages:
         """q_in, the event loop, f_in, f_out and q_out, as they are at this moment."""
         return replace(super().stages, after=self._stages_after(self._failure_in("f_out")))
+
+
+def event_id(event: Any) -> str:
+    """Return an event's id, if it has one that is a string; empty otherwise."""
+    try:
+        found = event.id
+        # A plain string, since a class of one's own may refuse to be compared.
+        return str.__str__(found) if isinstance(found, str) else ""
+    except BaseException:  # any object can be an event, whatever its attributes do
+        return ""
+
+
+class _Attempts:
+    """Counts the failures of events by id; forgets those that failed longest ago."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: OrderedDict[str, int] = OrderedDict()
+
+    def count(self, failed_id: str) -> int:
+        """Count one more failure of an event; return which one it is. Of an event without id it is the first."""
+        if not failed_id:
+            return 1
+        with self._lock:
+            self._counts[failed_id] = count = self._counts.pop(failed_id, 0) + 1
+            if len(self._counts) > _MAX_REMEMBERED:
+                self._counts.popitem(last=False)
+            return count
+
+
+def _where(events: Mapping[int, EventView]) -> list[str]:
+    """Return where the events under way are: one, unless several threads work on events."""
+    return [view.stage for view in tuple(events.values()) if view.stage]
+
+
+def queue_stage(name: str, queue: Any, *, is_waited_for: bool = False) -> Stage:
+    """Look at a queue, which may be any object.
+
+    Parameters
+    ----------
+    is_waited_for
+        Whether an answer waits to be put on it.
+    """
+    size, limit = _qsize(queue), _limit(queue)
+    notes = [f"{type(queue).__name__} {queue.policy}" if isinstance(queue, Mailbox) else type(queue).__name__]
+    if size is not None:
+        notes.append(f"{size} of {limit} waiting" if limit else f"{size} waiting")
+    if isinstance(queue, Mailbox):
+        notes += _dropped(queue.dropped)
+    return Stage("queue", name, "running" if is_waited_for else "static", tuple(notes))
+
+
+def _loop_stage(loop: EventLoop, failed: int) -> Stage:
+    """Look at an event loop, ``failed`` of whose events failed."""
+    events = counted(loop.handled, "event")
+    return Stage("loop", "EventLoop", "running" if loop.is_running else "stopped", (f"{events}, {failed} failed",))
+
+
+def _function_stage(name: str, function: Any, *, is_running: bool = False, failure: str = "") -> Stage:
+    """Look at f_in or f_out; ``failure`` is what it raised for the last event, if it did."""
+    state: StageState = "running" if is_running else "failed" if failure else "static"
+    its_own = _function_name(function)
+    return Stage("function", name, state, tuple(note for note in (its_own, failure) if note and note != name))
+
+
+def _function_name(function: Any) -> str:
+    with contextlib.suppress(Exception):  # any object can be called, whatever its attributes do
+        name = function.__name__
+        if isinstance(name, str):
+            return name
+    return type(function).__name__
+
+
+def _qsize(queue: Any) -> int | None:
+    """Return the size of a queue, if it has one that is a number."""
+    with contextlib.suppress(Exception):  # a multiprocessing queue has a qsize that raises on some systems
+        count = queue.qsize()
+        return count if type(count) is int else None
+    return None
+
+
+def _limit(queue: Any) -> int:
+    """Return how many items a queue holds; 0 if there is no limit, or none is known."""
+    with contextlib.suppress(Exception):
+        limit = queue.size if isinstance(queue, Mailbox) else queue.maxsize
+        return limit if type(limit) is int and limit > 0 else 0
+    return 0
+
+
+def _dropped(dropped: Mapping[str, int]) -> list[str]:
+    # A copy, since a producer may drop for another reason meanwhile.
+    return [f"{count} dropped: {reason}" for reason, count in dict(dropped).items()]

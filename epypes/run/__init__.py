@@ -2,11 +2,10 @@
 
 from epypes.run.failure import Failure
 from epypes.run.plan import Plan
-from epypes.run.record import Run
-from epypes.run.report import FunctionTime, RunReport
+from epypes.run.result import Run
 from epypes.run.runner import CompGraphRunner
-from epypes.run.summary import LogNormal, TimingSummary, summarize
-from epypes.run.tokens import NOT_COMPUTED, TokenManager
+from epypes.run.staleness import NOT_COMPUTED, TokenManager
+from epypes.run.timing import FunctionTime, LogNormal, RunReport, TimingSummary, summarize
 
 __all__ = [
     "NOT_COMPUTED",

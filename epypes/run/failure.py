@@ -1,4 +1,4 @@
-"""What is known of a function that failed?"""
+"""What is known of a function that failed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from epypes.run.draft import Draft
 from epypes.run.guard import explain_write, is_array, lend
+from epypes.run.staleness import TokenManager
 
 # A note is one line that names the culprit, so a value in it is short.
 _BRIEF: Final = 40
@@ -57,7 +57,7 @@ class Failure:
 
     @property
     def message(self) -> str:
-        """What the exception says, without OpenCV's place in its own source."""
+        """The text of the exception, without OpenCV's place in its own source."""
         try:
             # A plain string, whatever methods the one that is returned has.
             text = str.__str__(str(self.exception)).strip()
@@ -80,16 +80,16 @@ class Failure:
         )
 
 
-def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
-    """Describe what failed, and note on the user's exception which function and tokens it concerns."""
-    tokens, step = draft.program.tokens, draft.program.steps[index]
-    inputs = tuple(tokens[slot] for slot in step.inputs)
-    outputs = tuple(tokens[slot] for slot in step.outputs)
-    values = {token: _lent(draft.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
-    told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
+def failure_of(tokens: TokenManager, place: int, exception: BaseException) -> Failure:
+    """Describe the failure of a step, and note on the user's exception which function and tokens it concerns."""
+    names, step = tokens.program.tokens, tokens.program.steps[place]
+    inputs = tuple(names[slot] for slot in step.inputs)
+    outputs = tuple(names[slot] for slot in step.outputs)
+    values = {token: _lent(tokens.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
+    given = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
     begin, end = f"In function {step.name!r}: (", f") -> ({', '.join(outputs)})"
-    note = f"{begin}{told}{end}"
-    # Whatever the exception's own methods do, the failure is told.
+    note = f"{begin}{given}{end}"
+    # Whatever the exception's own methods do, the failure is reported.
     with contextlib.suppress(BaseException):
         why = None if step.unguarded else explain_write(step.name, inputs, exception)
         note = f"{note}\n{why}" if why else note
@@ -103,7 +103,7 @@ def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
 
 
 def _brief(value: Any) -> str:
-    """Return what a note says of an input: a small value itself, of an array its dtype and shape."""
+    """Return the text of an input in a note: a small value itself, of an array its dtype and shape."""
     with contextlib.suppress(Exception):  # of an integer with too many digits, or an array's own class
         if type(value) in (bool, int, float, type(None)) or (type(value) is str and len(value) <= _BRIEF):
             return f"={value!r:.{_BRIEF}}"

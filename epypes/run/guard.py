@@ -202,7 +202,7 @@ def keep(value: Any, fresh_count: int, program: Program, slot: int, values: Sequ
     """Return what a function returned as it is stored: arrays locked, and copied where others could write to them.
 
     A function that goes on using the memory of its result would change a value that has been handed out. So an
-    array to which somebody else holds a reference is copied; a new one, the usual case, is locked as it is. The same
+    array to which others hold a reference is copied; a new one, the usual case, is locked as it is. The same
     goes for mutable containers, and for the arrays in them and in tuples.
 
     Parameters
@@ -262,7 +262,7 @@ def _own(array: Any, is_known: bool, program: Program, slot: int, values: Sequen
         return array
     is_writable = array.flags.writeable
     while type(owner) is _ndarray or is_array(owner):
-        if (is_writable or owner.flags.writeable) and getrefcount(owner) > _FRESH_OWNER:
+        if (is_writable or owner.flags.writeable) and getrefcount(owner) > FRESH_OWNER:
             return array if not is_writable and _is_input(owner, program, slot, values) else _copy(array)
         owner = owner.base
         if owner is None:
@@ -419,4 +419,4 @@ def _measure_fresh() -> tuple[int, int, int, int]:
     return _count(result, 0), getrefcount(result), getrefcount(owner), item
 
 
-FRESH, FRESH_HERE, _FRESH_OWNER, _FRESH_ITEM = _measure_fresh()
+FRESH, FRESH_HERE, FRESH_OWNER, _FRESH_ITEM = _measure_fresh()

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.errors import HyperparameterError
+from epypes.errors import HyperparameterError, PayloadError, UnknownName
 from epypes.run.guard import ARRAYLESS, keep, require_reusable
 from epypes.run.program import Program
-from epypes.run.refused import wrong_payload
-from epypes.run.tokens import NOT_COMPUTED, is_same_value
+from epypes.run.staleness import NOT_COMPUTED, is_same_value
 
 if TYPE_CHECKING:
-    from epypes.run.attempt import Attempts
-
-_NOTHING: Final[Mapping[str, Any]] = {}
+    from epypes.run.execute import CompiledRun
 
 
 class Hyperparameters:
@@ -34,29 +32,27 @@ class Hyperparameters:
         That revision; -1 if other tokens were hyperparameters in it.
     plain
         The tokens whose values are numbers, texts or None: they hold no arrays, so functions get them as they are.
-    start
-        ``base``, ``free_slots`` and the attempts that the runner makes with these plain tokens, once it has made one.
+    repeated
+        The compiled run of every step with these plain tokens, ``base`` and ``free_slots``, once there is one.
     """
 
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    __slots__ = ("_base", "_free_slots", "changed", "entries", "follows", "plain", "program", "revision", "start")
+    __slots__ = ("_base", "_free_slots", "changed", "entries", "follows", "plain", "program", "repeated", "revision")
 
     def __init__(
         self,
         program: Program,
         entries: dict[str, tuple[Any, Any]],
         revision: int = 0,
-        changed: Mapping[str, Any] = _NOTHING,
-        follows: int = -1,
         plain: frozenset[str] = frozenset(),
     ) -> None:
         self.program = program
         self.entries = entries
         self.revision = revision
-        self.changed = changed
-        self.follows = follows
+        self.changed: Mapping[str, Any] = {}
+        self.follows = -1
         self.plain = plain
-        self.start: tuple[list[Any], dict[str, int], Attempts] | None = None
+        self.repeated: tuple[CompiledRun, list[Any], dict[str, int]] | None = None
         self._base: list[Any] | None = None
         self._free_slots: dict[str, int] | None = None
 
@@ -127,13 +123,19 @@ class Hyperparameters:
                 value = keep(value, 0, program, program.slots[token], ()) if program.guard else value
             new[token] = value
             entries[token] = (value, value if entry is None else entry[1])
-        return Hyperparameters(program, entries, revision + 1, new, follows, plain) if new else self
+        if not new:
+            return self
+        made = _new_hyperparameters()  # a slider makes some at each move: half the time of Hyperparameters(...)
+        made.program, made.entries, made.revision = program, entries, revision + 1
+        made.changed, made.follows, made.plain = new, follows, plain
+        made.repeated = made._base = made._free_slots = None
+        return made
 
     def unfrozen(self, token: str) -> Hyperparameters:
         """Return these without a token, which becomes a free source token."""
         self.require(token)
         entries = {name: entry for name, entry in self.entries.items() if name != token}
-        return Hyperparameters(self.program, entries, self.revision + 1, plain=self.plain - {token})
+        return Hyperparameters(self.program, entries, self.revision + 1, self.plain - {token})
 
     def with_payload(self, payload: Mapping[str, Any]) -> list[Any]:
         """Return the values by slot with which a run on a payload begins.
@@ -149,7 +151,7 @@ class Hyperparameters:
         for token, value in payload.items():
             slot = free.get(token)
             if slot is None:
-                raise wrong_payload(self.program.cg, token, free)
+                raise self._wrong_payload(token)
             values[slot] = value
             require_reusable(value, self.program, slot)
         if self.program.selectors:
@@ -190,3 +192,18 @@ class Hyperparameters:
             f"Token {token!r} is a free source token, not a hyperparameter. "
             f"Pass it to run({token}=...), or make it one: freeze({token}=...).",
         )
+
+    def _wrong_payload(self, token: str) -> Exception:
+        """Return the error that says why a token can't be given to ``run``."""
+        cg = self.program.cg
+        if token not in cg.tokens:
+            return UnknownName("token", token, self.free_slots)
+        maker = cg.digraph.producer.get(token)
+        if maker is not None:
+            text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
+        else:
+            text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
+        return PayloadError((token,), text)
+
+
+_new_hyperparameters: Final[Callable[[], Hyperparameters]] = partial(object.__new__, Hyperparameters)

@@ -6,22 +6,24 @@ A graph is compiled once: tokens become slot numbers, functions become steps in 
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, Final, NamedTuple
+from weakref import ref
 
 from epypes.graph import CompGraph, Switch, as_switch
-from epypes.graph.checks import distinct
 from epypes.images import Contracts
 from epypes.run.guard import called_for, is_unguarded
 
 # What a function has that keeps hyperparameters of its own: a method that returns another value whenever they have
 # changed, given the programs that ask for it.
 REVISION: Final = "__epypes_revision__"
-# What a function has that keeps account of its calls: where it is true, its ``func`` may be called in its place, if
-# ``count_call`` is called too.
+# What a function has that measures its calls: where it is true, a program calls its ``func`` in its place, and has it
+# count the call when the run has ended.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
+MAX_UNCOUNTED: Final = 100
 # More objects than any function refers to on purpose.
 _MOST_REACHED: Final = 1_000
 
@@ -45,6 +47,8 @@ class Step(NamedTuple):
         What its annotations say of the images that it takes and makes; by input and by output, if they say anything.
     is_plain
         Whether its inputs are lent and nothing more is to be done about them.
+    node
+        The function, if it is a node whose ``func`` may be called in its place.
     """
 
     place: int
@@ -57,10 +61,11 @@ class Step(NamedTuple):
     switch: Switch | None
     contracts: Contracts | None
     is_plain: bool
+    node: Any
 
 
 class Program:
-    """A compiled graph; nothing in it changes.
+    """A compiled graph; nothing in it changes but ``running``.
 
     Attributes
     ----------
@@ -78,6 +83,14 @@ class Program:
         The functions, in run order.
     switches, placeholders
         The steps that are one.
+    nodes
+        The steps that have a node, with it.
+    clean
+        The dirty flags of a run in which every step is up to date.
+    uncounted
+        Of runs that have ended, nanoseconds by step, for nodes to count; None if there are no nodes.
+    running
+        What runs at this moment, in any thread: objects whose ``running`` is a step, or -1.
     selectors
         By the selector's token, the switches that it selects for.
     revised
@@ -89,13 +102,20 @@ class Program:
         self.cg, self.guard, self.check_mutation, self.tokens = cg, guard, check_mutation, cg.tokens
         self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
         self.steps = steps = tuple(_steps(cg, slots, guard and not check_mutation))
+        self.nodes = tuple((step.place, step.node) for step in steps if step.node is not None)
+        self.uncounted: deque[Mapping[int, int]] | None = deque() if self.nodes else None
+        for _, node in self.nodes:
+            node.programs.append(ref(self, node.programs.remove))
+        self.running: set[Any] = set()
+        self.clean = bytes(len(steps))
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
-        functions = {key: function for key, function in distinct(cg.functions).items() if not _is_alone(function)}
+        functions = {id(function): function for function in cg.functions.values() if not _is_alone(function)}
         found = {key: objects for key, function in functions.items() if (objects := tuple(_with_revisions(function)))}
-        self.revised = tuple(step.place for step in steps if id(step.function) in found) if found else ()
-        self._with_revisions = tuple(found[id(steps[place].function)] for place in self.revised)
+        revised = [step for step in steps if id(cg.functions[step.name]) in found] if found else []
+        self.revised = tuple(step.place for step in revised)
+        self._with_revisions = tuple(found[id(cg.functions[step.name])] for step in revised)
         self.selectors: dict[str, list[Switch]] = {}
         for place in self.switches:
             step = steps[place]
@@ -141,6 +161,26 @@ class Program:
         except LookupError:
             return step.inputs  # the selector has no value, or one that is refused when the step runs
         return step.inputs[0], step.inputs[1 + branch]
+
+    def running_functions(self) -> tuple[str, ...]:
+        """Return the functions that were called and have not returned, in run order."""
+        places = {getattr(each, "running", -1) for each in tuple(self.running)}
+        return tuple(self.steps[place].name for place in sorted(places) if place >= 0)
+
+    def note_calls(self, durations_ns: Mapping[int, int]) -> None:
+        """Take note of the calls of nodes in a run that has ended."""
+        if self.uncounted is not None:
+            self.uncounted.append(durations_ns)
+            self.count_calls()
+
+    def count_calls(self) -> None:
+        """Have the nodes count the calls of the runs that have ended; done when a node is asked for them."""
+        with contextlib.suppress(IndexError):
+            while self.uncounted:
+                durations_ns = self.uncounted.popleft()
+                for place, node in self.nodes:
+                    if place in durations_ns:
+                        node.count_call(durations_ns[place])
 
     def downstream(self, starts: Iterable[int], values: Sequence[Any]) -> set[int]:
         """Return these steps and every step that, with these values, depends on one of them."""
@@ -214,6 +254,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
     for place, ((name, function), (inputs, outputs, io)) in enumerate(zip(cg.functions.items(), sides, strict=True)):
         function = called_for(name, function)
         unguarded, switch, contract = is_unguarded(function), switches.get(name), contracts.get(name)
+        has_node = hasattr(type(function), IS_ITS_FUNC) and getattr(function, IS_ITS_FUNC)
         yield _new_step((
             place,
             name,
@@ -225,28 +266,9 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
             switch,
             contract,
             lends_only and not unguarded and switch is None and contract is None,
+            function if has_node else None,
         ))  # fmt: skip
 
 
 # For large graphs: half the time of Step(...).
 _new_step: Final[Callable[[Iterable[Any]], Step]] = partial(tuple.__new__, Step)
-
-
-def longest_path_ns(program: Program, durations_ns: Mapping[int, int]) -> int:
-    """Return how long those functions take that need each other's outputs one after another, at most."""
-    ends_ns: dict[int, int] = {}
-    for place in sorted(durations_ns):
-        makers = {program.makers[slot] for slot in program.steps[place].inputs}
-        ends_ns[place] = durations_ns[place] + max((ends_ns.get(maker, 0) for maker in makers), default=0)
-    return max(ends_ns.values(), default=0)
-
-
-def is_its_func(function: object) -> bool:
-    """Whether a function keeps account of its calls, and its ``func`` may be called in its place."""
-    return hasattr(type(function), IS_ITS_FUNC) and bool(getattr(function, IS_ITS_FUNC))
-
-
-def count_call(function: Any, duration_ns: int) -> None:
-    """Have a function take a call of its ``func`` in its place into account."""
-    function.duration_ns = duration_ns
-    function.run_count = function.next_count()

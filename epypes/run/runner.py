@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from copy import copy
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Final
+from weakref import ref
 
-from epypes.errors import StaleToken, require_mapping
-from epypes.graph import CompGraph
-from epypes.run.attempt import AttemptsByKind, Outcome
-from epypes.run.call import StepFailed
-from epypes.run.draft import draft_after, tokens_now
+from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
+from epypes.graph import CompGraph, redefined
+from epypes.run.execute import CompiledRun, Executor
+from epypes.run.failure import failure_of
 from epypes.run.guard import COPIERS, lend, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.plan import Plan, plan
-from epypes.run.program import Program
-from epypes.run.record import Run, new_run
-from epypes.run.refused import nothing_computed, nothing_run, require_targets
-from epypes.run.report import Reports
-from epypes.run.told import one_line
-from epypes.run.trials import Trials
-from epypes.run.underway import running_functions
-from epypes.run.watchers import Watchers
+from epypes.run.plan import Plan, check_ready, plan, wanted_steps
+from epypes.run.program import MAX_UNCOUNTED, Program
+from epypes.run.result import Run, TrialOf, new_run
+from epypes.run.staleness import TokenManager
+from epypes.run.timing import Reports
+from epypes.wording import counted
 
 Payload = Mapping[str, Any]
 
+_LOG: Final = logging.getLogger(__name__)
+_MAX_TARGETS: Final = 64
 
-class CompGraphRunner:
-    """Runs a graph; reads like a dictionary of its tokens.
+
+class CompGraphRunner(Mapping[str, Any]):
+    """Runs a graph; a mapping of its tokens that can be read now.
+
+    These are the hyperparameters, and what the last run has left that is not stale, in graph order. Reading any other
+    token raises; ``get`` returns its default. If other threads run it meanwhile, ``dict(runner.last)`` is of one run.
 
     Parameters
     ----------
@@ -88,15 +93,26 @@ class CompGraphRunner:
         self.workers = workers
         self.guard = guard
         self.check_mutation = check_mutation
-        self.reports = Reports()
         self._program = Program(cg, guard, check_mutation)
-        self._attempts = AttemptsByKind(self._program, workers)
-        self._lock = threading.Lock()
-        self._trials = Trials()
-        self._watchers = Watchers()
+        self._executor = Executor(self._program, workers)
+        # The steps that targets need, where no switch has a say in it.
+        self._wanted: dict[tuple[str, ...], bytes] = {}
+        self._own_state()
         self.last: Run | None = None
         given = {**cg.defaults, **hparams}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
+
+    def _own_state(self) -> None:
+        """Make what no two runners share, besides hyperparameters and the last run."""
+        self._lock = threading.Lock()
+        # What a trial remembers of its runner.
+        self._key = object()
+        # Replaced as a whole, so that calling them needs no lock.
+        self._watchers: tuple[Callable[[], object], ...] = ()
+        self.reports = Reports()
+        self._keep_times = self.reports.kept.append
+        # The run that failed last on each thread: `last` may be another thread's run by then.
+        self._failed = threading.local()
 
     # -- running ------------------------------------------------------------------------------------------------
 
@@ -135,47 +151,39 @@ class CompGraphRunner:
     def run_on(self, payload: Payload, targets: Sequence[str] = ()) -> Run:
         """Do what ``run`` does, with the payload as a mapping by free source token."""
         start_ns = perf_counter_ns()
-        hparams = self._hparams
-        if hparams.start is None:
-            hparams.start = hparams.base, hparams.free_slots, self._attempts[hparams.plain]
-        base, slots, attempts = hparams.start
-        compiled = attempts.short_way.whole
-        if compiled is None or targets or len(payload) != len(slots):
-            return self._run_anyhow(payload, targets, start_ns, hparams)
-        # The way of a stream of images: as short as can be.
+        hparams, program = self._hparams, self._program
+        repeated = hparams.repeated
+        if repeated is None or targets or len(payload) != len(repeated[2]):
+            return self._run_from_scratch(hparams, payload, targets, start_ns, None)
+        # A stream of images goes this way: as short as can be.
+        compiled, base, slots = repeated
         values = base.copy()
         try:
             for token in payload:
                 value = values[slots[token]] = payload[token]
                 if type(value) not in COPIERS:
-                    require_reusable(value, self._program, slots[token])
+                    require_reusable(value, program, slots[token])
         except KeyError:
-            return self._run_anyhow(payload, targets, start_ns, hparams)
-        try:
-            durations_ns = compiled(values)
-        except StepFailed as failed:
-            outcome = attempts.run_broken_off(values, failed, None, True, start_ns)
-        else:
-            times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
-            run = new_run()
-            run.record = values, attempts.clean, hparams, times, None
-            self._lock.acquire()  # half the time of a with statement
-            try:
-                self.last = run
-            finally:
-                self._lock.release()
-            self.reports.kept.append(times)
-            if self._watchers.callbacks:
-                self._watchers.tell()
-            return run
-        return self._ended(outcome, hparams)
+            return self._run_from_scratch(hparams, payload, targets, start_ns, None)
+        return self._repeat(compiled, values, None, None, hparams, start_ns, None)
 
-    def _run_anyhow(self, payload: Payload, targets: Sequence[str], start_ns: int, hparams: Hyperparameters) -> Run:
-        if targets:
-            require_targets(self.cg, targets, tuple(hparams.free_slots))
+    def _run_from_scratch(
+        self,
+        hparams: Hyperparameters,
+        payload: Payload,
+        targets: Sequence[str],
+        start_ns: int,
+        trial_of: TrialOf | None,
+    ) -> Run:
+        """Run everything that the targets need, everything without, on a payload."""
+        self._require_targets(targets)
         values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
-        attempts = self._attempts[hparams.plain]
-        return self._ended(attempts.whole(values, payload, has_payload, targets, start_ns), hparams)
+        tokens = TokenManager.from_scratch(self._program, values, has_payload)
+        try:
+            return self._run(tokens, hparams, targets, payload, start_ns, trial_of)
+        finally:
+            if hparams.repeated is None and (compiled := self._executor.whole(hparams.plain)) is not None:
+                hparams.repeated = compiled, hparams.base, hparams.free_slots
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -191,54 +199,147 @@ class CompGraphRunner:
         Exception
             Whatever a function raises, unchanged, with a note.
         """
+        return self._go_on(changes, targets, False)
+
+    def _go_on(self, changes: Mapping[str, Any], targets: tuple[str, ...], is_trial: bool) -> Run:
+        """Change hyperparameters, and run the stale functions on the tokens of the last run."""
         start_ns = perf_counter_ns()
         if targets:
-            require_targets(self.cg, targets, self.free_source_tokens)
+            self._require_targets(targets)
+        program = self._program
         with self._lock:
-            hparams, last = self._hparams.frozen(changes, also_new=False), self.last
-            self._hparams = hparams
-        changed, compiled = hparams.changed, None
+            first, last = self._hparams, self.last
+            hparams = first.frozen(changes, also_new=False)
+            if not is_trial:
+                self._hparams = hparams
         if last is None:
-            raise nothing_run(self.free_source_tokens)
-        attempts = self._attempts[hparams.plain]
-        stored, freshness, before = last.record[:3]
-        if freshness.is_clean and not targets and hparams.follows == before.revision:
-            compiled = attempts.short_way.of_changes(changed)
-        if compiled is None:
-            outcome = attempts.stale(draft_after(self._program, last, hparams), targets, start_ns)
-        else:
-            # The way of a slider: as short as can be.
-            values = stored.copy()
-            try:
-                durations_ns = compiled(values, changed.values())
-            except StepFailed as failed:
-                outcome = attempts.rerun_broken_off(values, failed, changed, start_ns)
-            else:
-                times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
-                run = Run((values, freshness, hparams, times, None))
-                with self._lock:
-                    self.last = run
-                self.reports.kept.append(times)
-                if self._watchers.callbacks:
-                    self._watchers.tell()
-                return run
-        # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too ...
-        del last, stored, freshness
-        return self._ended(outcome, hparams)
+            free = self.free_source_tokens
+            raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first.")
+        trial_of = (self._key, first, ref(last)) if is_trial else None
+        values, dirty, has_payload, _, before, _, failure = last.record
+        # A failure keeps this frame, with all that is named in it: the run before, which may have failed too.
+        del failure
+        if hparams.follows == before.revision and has_payload and not program.revised:
+            # A slider goes this way: as short as can be.
+            changed, wanted = hparams.changed, self._wanted.get(targets) if targets else None
+            compiled = self._executor.repeated.get((hparams.plain, wanted, dirty, (*changed,)))
+            if compiled is not None and (wanted is not None or not targets):
+                values = values.copy()
+                for token, value in changed.items():
+                    values[program.slots[token]] = value
+                del last
+                return self._repeat(compiled, values, dirty, wanted, hparams, start_ns, trial_of)
+        tokens = last.tokens.branch()
+        del last, values
+        new = tokens.change(hparams.changes_since(before))
+        return self._run(tokens, hparams, targets, (), start_ns, trial_of, new)
 
-    def _ended(self, outcome: Outcome, hparams: Hyperparameters) -> Run:
-        """Make what was run the last Run; raise the user's exception if a function failed.
+    def _run(
+        self, tokens: TokenManager, hparams: Hyperparameters, targets: Sequence[str], payload: Collection[str],
+        start_ns: int, trial_of: TrialOf | None, changed: tuple[str, ...] = (),
+    ) -> Run:  # fmt: skip
+        """Run the dirty steps that the targets need, all without; make the run the last one unless it is a trial."""
+        program = self._program
+        wanted = wanted_steps(program, tokens.values, targets) if targets or program.switches else None
+        if program.placeholders or not tokens.has_payload:
+            check_ready(program, tokens.values, wanted, payload)
+        if wanted is not None and not program.switches and len(self._wanted) < _MAX_TARGETS:
+            self._wanted[tuple(targets)] = wanted
+        durations_ns: dict[int, int] = {}
+        side_by_side, error = self._executor.execute(tokens, wanted, durations_ns, hparams.plain, changed)
+        if error is not None:
+            run = self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error, side_by_side)
+        else:
+            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1
+            program.note_calls(durations_ns)
+            dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
+            run = Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, None))
+        return self._end(run, trial_of)
+
+    def _repeat(
+        self, compiled: CompiledRun, values: list[Any], origin: bytes | None, wanted: bytes | None,
+        hparams: Hyperparameters, start_ns: int, trial_of: TrialOf | None,
+    ) -> Run:  # fmt: skip
+        """Do what ``_run`` does, with a compiled run; ``origin`` are the dirty steps, None from scratch."""
+        program, error = self._program, None
+        revisions = program.revisions() if program.revised else ()
+        durations_ns: dict[int, int] = {}
+        dirty = None if origin is None else bytearray(origin)
+        run = new_run()
+        program.running.add(run)
+        try:
+            compiled(run, values, dirty, durations_ns)
+        except BaseException as raised:
+            error = raised
+        finally:
+            program.running.discard(run)
+        if error is not None:
+            tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
+            tokens.running, tokens.origin = getattr(run, "running", 0), origin
+            return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
+        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        # Without targets everything is up to date then.
+        left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
+        run.record = values, left_dirty, True, revisions, hparams, times, None
+        if (uncounted := program.uncounted) is not None:
+            uncounted.append(durations_ns)
+            if len(uncounted) > MAX_UNCOUNTED:
+                program.count_calls()
+        if trial_of is not None:
+            run.trial_of = trial_of
+            return run
+        with self._lock:
+            self.last = run
+        self._keep_times(times)
+        if self._watchers:
+            self._tell_watchers()
+        return run
+
+    def _failed_run(
+        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: dict[int, int],
+        start_ns: int, error: BaseException, side_by_side: bool = False,
+    ) -> Run:  # fmt: skip
+        """Return what is left of a run in which a step raised: the step that was running."""
+        program, failed_at = self._program, max(0, tokens.running)
+        total_ns = perf_counter_ns() - start_ns
+        durations_ns.setdefault(failed_at, 0)
+        program.note_calls(durations_ns)
+        if tokens.origin is None:
+            tokens.dirty = bytearray(step.place not in durations_ns for step in program.steps)
+        failure = failure_of(tokens, failed_at, error)
+        tokens.forget(program.downstream([failed_at], tokens.values))
+        # Of the steps that were not reached none was reused.
+        reached = bytearray(wanted or b"\1" * len(program.steps))
+        for place in tokens.stale:
+            reached[place] = 0
+        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at
+        dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
+        return Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, failure))
+
+    def _end(self, run: Run, trial_of: TrialOf | None) -> Run:
+        """Make a run the last one unless it is a trial; raise the user's exception if a function failed.
 
         To be called where no exception is being handled, which would become the context of the user's.
         """
-        run = Run((*outcome[:2], hparams, *outcome[2:]))
+        if trial_of is not None:
+            run.trial_of = trial_of
+            return run
         with self._lock:
             self.last = run
-        self.reports.add(run.record[3])
-        self._watchers.tell()
-        if run.failure is not None:
-            raise run.failure.exception
+        *_, times, failure = run.record
+        self.reports.add(times)
+        if self._watchers:
+            self._tell_watchers()
+        if failure is not None:
+            self._failed.run = ref(run)
+            raise failure.exception
         return run
+
+    def failed_run(self, exception: BaseException) -> Run | None:
+        """Return the run of this thread that raised an exception; None if it did not come out of this runner."""
+        last: ref[Run] | None = getattr(self._failed, "run", None)
+        run = None if last is None else last()
+        return run if run is not None and run.failure is not None and run.failure.exception is exception else None
 
     def trial(self, values: Mapping[str, Any], /, *targets: str, payload: Mapping[str, Any] | None = None) -> Run:
         """Run with other hyperparameters, or on another payload, and leave the runner as it is.
@@ -262,21 +363,13 @@ class CompGraphRunner:
         HyperparameterError, PayloadError, PlaceholderNeeded, UnknownName
             As ``rerun`` and ``run`` do.
         """
+        if payload is None:
+            return self._go_on(values, targets, True)
         start_ns = perf_counter_ns()
-        require_targets(self.cg, targets, self.free_source_tokens)
         before, last = self._state
         hparams = before.frozen(values, also_new=False)
-        attempts = self._attempts[hparams.plain]
-        if payload is not None:
-            has_payload = len(payload) == len(hparams.free_slots)
-            outcome = attempts.whole(hparams.with_payload(payload), payload, has_payload, targets, start_ns)
-        elif last is None:
-            raise nothing_run(self.free_source_tokens)
-        else:
-            outcome = attempts.stale(draft_after(self._program, last, hparams), targets, start_ns)
-        run = Run((*outcome[:2], hparams, *outcome[2:]))
-        self._trials.add(run, before, last)
-        return run
+        trial_of = self._key, before, None if last is None else ref(last)
+        return self._run_from_scratch(hparams, payload, targets, start_ns, trial_of)
 
     def adopt(self, run: Run, /) -> bool:
         """Make a run of ``trial`` the last one and its hyperparameters the runner's, in one step.
@@ -288,14 +381,15 @@ class CompGraphRunner:
         ValueError
             The run was not tried by this runner.
         """
-        if run not in self._trials:
+        key, before, last = getattr(run, "trial_of", (None, None, None))
+        if key is not self._key:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
         with self._lock:
-            if not self._trials.began_from(run, self._hparams, self.last):
+            if before is not self._hparams or (None if last is None else last()) is not self.last:
                 return False
-            self._hparams, self.last = run.record[2], run
-        self.reports.add(run.record[3])
-        self._watchers.tell()
+            self._hparams, self.last = run.record[4], run
+        self.reports.add(run.record[5])
+        self._tell_watchers()
         return True
 
     def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
@@ -303,14 +397,39 @@ class CompGraphRunner:
 
         It is called on the thread that did it, so it must return at once. What it raises is logged.
         """
-        return self._watchers.add(callback)
+        # A callable of its own for each call, so that one callback may be added twice and taken out once.
+        entry = lambda: callback()  # noqa: E731
+        with self._lock:
+            self._watchers = (*self._watchers, entry)
+
+        def remove() -> None:
+            with self._lock:
+                self._watchers = tuple(other for other in self._watchers if other is not entry)
+
+        return remove
+
+    def _tell_watchers(self) -> None:
+        for callback in self._watchers:
+            try:
+                callback()
+            except Exception:
+                _LOG.exception("A watcher of a runner has failed")
 
     def plan(self, /, *targets: str) -> Plan:
         """Return what ``rerun(*targets)`` would do, and why."""
-        require_targets(self.cg, targets, self.free_source_tokens)
+        self._require_targets(targets)
         hparams, last = self._state
-        changed = () if last is None else tuple(hparams.changes_since(last.record[2]))
-        return plan(tokens_now(self._program, last, hparams), targets, changed, hparams)
+        changed = () if last is None else tuple(hparams.changes_since(last.record[4]))
+        return plan(self._tokens_now(hparams, last), targets, changed, hparams)
+
+    def _require_targets(self, targets: Sequence[object]) -> None:
+        """Raise unless all of these are names of tokens."""
+        for token in targets:
+            if not isinstance(token, str):
+                kind, free = type(token).__name__, self.free_source_tokens
+                text = f"A target is the name of a token, not {kind!r}. Payload goes by name: {run_call(free)}."
+                raise PayloadError(free, text)
+            self.cg.require_token(token)
 
     # -- hyperparameters ----------------------------------------------------------------------------------------
 
@@ -342,7 +461,7 @@ class CompGraphRunner:
         """Make a hyperparameter a free source token again."""
         with self._lock:
             self._hparams = self._hparams.unfrozen(token)
-        self._watchers.tell()
+        self._tell_watchers()
 
     def set(self, /, **values: Any) -> None:
         """Set hyperparameters, all or none of them, at once: a run has all of the new values or none.
@@ -360,7 +479,7 @@ class CompGraphRunner:
     def _change(self, values: Mapping[str, Any], also_new: bool) -> None:
         with self._lock:
             self._hparams = self._hparams.frozen(values, also_new=also_new)
-        self._watchers.tell()
+        self._tell_watchers()
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -372,13 +491,26 @@ class CompGraphRunner:
     @property
     def running(self) -> tuple[str, ...]:
         """The functions that are being run at this moment, in whatever thread, in run order."""
-        return running_functions(self._program)
+        return self._program.running_functions()
 
     @property
     def _state(self) -> tuple[Hyperparameters, Run | None]:
         """The hyperparameters and the last run, of one moment."""
         with self._lock:
             return self._hparams, self.last
+
+    def _tokens_now(self, hparams: Hyperparameters, last: Run | None) -> TokenManager:
+        """Return a run's tokens as they are to be read with these hyperparameters.
+
+        Both are given, so that what is read beside a rerun in another thread is decided from one state.
+        """
+        if last is None:
+            return TokenManager.from_scratch(self._program, hparams.base.copy(), not hparams.free_slots)
+        if last.record[4] is hparams and not self._program.revised:
+            return last.tokens
+        tokens = last.tokens.branch()
+        tokens.change(hparams.changes_since(last.record[4]))
+        return tokens
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._state
@@ -387,31 +519,101 @@ class CompGraphRunner:
             return lend(value) if self.guard else value
         if last is None:
             self.cg.require_token(token)
-            raise nothing_computed(token, hparams.free_slots)
+            text = f"Token {token!r} has not been computed: nothing has been run. Call {run_call(hparams.free_slots)}."
+            raise NotComputed(token, text)
         value = last[token]
-        if tokens_now(self._program, last, hparams).is_stale(token):
+        if self._tokens_now(hparams, last).is_stale(token):
             raise StaleToken(token)
         return value
 
-    def __contains__(self, token: object) -> bool:
-        return token in self.keys()
-
     def __iter__(self) -> Iterator[str]:
-        return iter(self.keys())
+        hparams, last = self._state
+        now, frozen = self._tokens_now(hparams, last), hparams.entries
+        return iter([token for token in self.cg.tokens if token in frozen or now.is_readable(token)])
 
     def __len__(self) -> int:
-        return len(self.keys())
+        return sum(1 for _ in self)
 
-    def keys(self) -> tuple[str, ...]:
-        """Return the tokens that can be read now, in graph order."""
-        hparams, last = self._state
-        now, frozen = tokens_now(self._program, last, hparams), hparams.entries
-        return tuple(token for token in self.cg.tokens if token in frozen or now.is_readable(token))
+    # Values may be arrays, and a runner changes: runners are told apart by identity.
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     def __repr__(self) -> str:
-        return one_line(self)
+        last, redefinitions = self.last, len(redefined(self.cg))
+        old = f" ({redefinitions} redefined)" * bool(redefinitions)
+        if last is None:
+            state = "not run yet"
+        elif last.failure:
+            state = f"failed in {last.failure.function!r:.{24 - len(old)}}"
+        else:
+            state = f"{counted(len(self.stale), 'function')} stale" if self.stale else "up to date"
+        functions, frozen = counted(len(self.cg.functions), "function"), len(self.hyperparameters)
+        return f"<CompGraphRunner: {functions}{old}, {counted(frozen, 'hyperparameter')}; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle
 
         return mimebundle(self)
+
+
+def branched(runner: CompGraphRunner) -> CompGraphRunner:
+    """Return a runner with the hyperparameters and the last run of another one, that goes its own way from there.
+
+    Both share values and what is compiled, and no state: each may be used on a thread of its own.
+    """
+    hparams, last = runner._state
+    branch = copy(runner)
+    branch._own_state()
+    branch._hparams, branch.last = hparams, last
+    return branch
+
+
+def stop_at(
+    runner: CompGraphRunner, payload: Payload, function: str | None = None, why: BaseException | None = None
+) -> Run:
+    """Run what a function needs, and have it fail without being called; the run becomes the runner's last.
+
+    ``rerun`` goes on from there, and calls it. It is for functions that are known to kill or to hang.
+
+    Parameters
+    ----------
+    payload
+        The free source tokens by name.
+    function
+        Without, no function at all is called, and the run has the payload alone.
+    why
+        What the function fails with. If one that it needs fails, the run is that one's.
+
+    Raises
+    ------
+    PayloadError, PlaceholderNeeded, UnknownName
+        As ``run`` does.
+    """
+    start_ns = perf_counter_ns()
+    hparams, program, cg = runner._state[0], runner._program, runner.cg
+    needed = [] if function is None else [token for token in cg.func_inputs(function) if token not in cg.source_tokens]
+    if needed:
+        before = runner.trial({}, *needed, payload=payload)
+        if before.failure is not None:
+            runner.adopt(before)
+            return before
+        tokens, durations_ns = before.tokens.branch(), dict(before.report.ran_ns)
+    else:
+        values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
+        tokens = TokenManager.from_scratch(program, values, has_payload)
+        durations_ns = {}
+    wanted = bytes(len(program.steps))
+    if function is None or why is None:
+        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        run = Run((tokens.values, bytes(tokens.dirty), tokens.has_payload, tokens.revisions, hparams, times, None))
+    else:
+        tokens.running = next(step.place for step in program.steps if step.name == function)
+        run = runner._failed_run(tokens, hparams, wanted, durations_ns, start_ns, why)
+    try:
+        return runner._end(run, None)
+    except BaseException as raised:
+        if raised is not why:
+            raise
+        return run

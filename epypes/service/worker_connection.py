@@ -200,7 +200,7 @@ def functions_in_trace(text: str, module: str) -> tuple[str, ...]:
     >>> trace = '''Thread 0x7f (most recent call first):
     ...   File "/b/pipeline.py", line 9 in helper
     ...   File "/b/pipeline.py", line 4 in match
-    ...   File "/x/epypes/run/call.py", line 30 in call
+    ...   File "/x/epypes/run/execute.py", line 30 in call
     ... '''
     >>> functions_in_trace(trace, "/b/pipeline.py")
     ('match',)

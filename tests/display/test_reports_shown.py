@@ -15,7 +15,7 @@ import epypes as ep
 from epypes.display import mimebundle
 from epypes.display.views.times import report_times
 from epypes.run.program import Program
-from epypes.run.report import Reports
+from epypes.run.timing import Reports
 from tests.display.test_display import SVG, texts
 from tests.display.test_plans import branching_runner, report_of, table_of
 from tests.pictures import assert_same_picture

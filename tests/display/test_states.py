@@ -17,7 +17,7 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.layout.place import lay_out
-from epypes.run import gain
+from epypes.run import execute
 from tests.display.test_display import SVG, texts, vertices
 
 TIMEOUT_S = 60.0
@@ -100,7 +100,7 @@ def test_a_rerun_tells_what_is_being_run_too(gate, reruns_before):
 
 
 def test_functions_side_by_side_are_all_told(gate, monkeypatch):
-    monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+    monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: True)
     functions = {"left": lambda x: gate(x), "right": lambda x: gate(x)}
     runner = ep.CompGraphRunner(ep.CompGraph(functions, {"left": ("x", "a"), "right": ("x", "b")}), workers=2)
     with gate.holding(lambda: runner.run(x=1), count=2):

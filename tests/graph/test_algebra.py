@@ -348,6 +348,11 @@ def test_a_default_that_is_an_array_is_one_with_its_equal():
         one | other
 
 
+def test_a_suffix_is_a_text(single):
+    with pytest.raises(TypeError, match='A suffix must be a string, such as "_1", not 1'):
+        ep.suffix(single, 1)
+
+
 def test_suffixes_have_an_order():
     cg = ep.CompGraph({"f": abs}, {"f": ("x", "y")})
     with pytest.raises(ValueError, match="needs a sequence of 2 suffixes"):

@@ -109,6 +109,12 @@ def test_what_cannot_be_called_is_refused():
         ep.CompGraph({"f": 3}, {"f": ("x", "y")})
 
 
+@pytest.mark.parametrize("name", [3, "", None])
+def test_the_name_of_a_function_is_a_text(name):
+    with pytest.raises(GraphError, match="A function's name must be a string that is not empty, not"):
+        ep.CompGraph({name: identity}, {name: ("x", "y")})
+
+
 def test_every_problem_is_reported_at_once():
     with pytest.raises(GraphError) as error:
         ep.CompGraph(

@@ -9,8 +9,8 @@ import time
 import pytest
 
 import epypes as ep
+from epypes.errors import GraphError
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.signature import NO_DEFAULT, parameters_of
 
 
 def chain(count):
@@ -62,16 +62,19 @@ class Callable:
 
 
 @pytest.mark.parametrize("function", [plain, wrapped, ep.Node("n", plain)])
-def test_code_and_signature_say_the_same(function):
-    found = parameters_of(function)
-    assert found.positional == (("a", NO_DEFAULT), ("b", NO_DEFAULT), ("c", 3))
-    assert (found.least, found.most, found.required_by_keyword) == (2, float("inf"), ("d",))
+def test_plain_and_wrapped_functions_are_checked_alike(function):
+    with pytest.raises(GraphError, match=r"Function 'f' takes 2 to inf inputs .*, but its io names 1: \(a\)"):
+        ep.CompGraph({"f": function}, {"f": ("a", "y")})
+    with pytest.raises(GraphError, match="Function 'f' needs 'd' by keyword"):
+        ep.CompGraph({"f": function}, {"f": (("a", "b", "c", "g"), "y")})
 
 
 def test_methods_callables_and_c_functions_are_asked_for_their_signature():
-    assert parameters_of(Callable().method).positional == (("a", NO_DEFAULT), ("b", 2))
-    assert parameters_of(Callable()).required_by_keyword == ("k",)
-    assert parameters_of(iter) is None
+    with pytest.raises(GraphError, match="takes 1 to 2 inputs"):
+        ep.CompGraph({"f": Callable().method}, {"f": (("a", "b", "c"), "y")})
+    with pytest.raises(GraphError, match="needs 'k' by keyword"):
+        ep.CompGraph({"f": Callable()}, {"f": ("a", "y")})
+    ep.CompGraph({"f": iter}, {"f": (("a", "b", "c", "d"), "y")})
 
 
 def test_a_signature_is_read_once_per_function_object():

@@ -151,4 +151,4 @@ def test_nodes_methods_and_decorated_functions_work():
 
 def test_a_default_survives_in_a_pipeline():
     pipe = ep.Pipeline("p", ep.CompGraph.from_functions(gray, edges))
-    assert dict(pipe.network.cg.defaults) == {"threshold": 70}
+    assert dict(pipe.network.defaults) == {"threshold": 70}

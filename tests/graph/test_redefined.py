@@ -7,7 +7,7 @@ import types
 import pytest
 
 import epypes as ep
-from epypes.graph.redefined import redefined
+from epypes.graph import redefined
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import epypes as ep
 from epypes.errors import GraphError
-from epypes.graph.disjoint import are_disjoint
+from epypes.graph.type_check import are_disjoint
 
 T = TypeVar("T")
 
@@ -62,7 +62,7 @@ Metres = typing.NewType("Metres", float)
         (int, str), (np.ndarray, int), (str, np.ndarray), (None, int), (list[int], dict[str, int]), (tuple, list),
         (Circle, Square), (Colour, str), (Path, str), (typing.Optional[int], str),  # noqa: UP045
         (typing.Union[int, str], list[int] | tuple),  # noqa: UP007
-        (Literal["a"], int), (Literal["a", "b"], Literal["c"]), (Literal[1], Literal[True]), (Literal[Colour.RED], int),
+        (Literal["a"], int), (Literal["a", "b"], Literal[2]), (Literal[Colour.RED], int),
         (Annotated[int, "pixels"], str), (Annotated[int | None, 1], Annotated[str, 2]),
         (NDArray[np.uint8], NDArray[np.float64]), (NDArray[np.float32], NDArray[np.float64]), (NDArray[np.uint8], str),
         (np.float64, str), (bytes, str),

@@ -1,4 +1,4 @@
-"""Does every answer belong to its event, its hyperparameters and its own run, and every failure to its function?"""
+"""Every answer belongs to its event, its hyperparameters and its own run, and every failure to its function."""
 
 from __future__ import annotations
 

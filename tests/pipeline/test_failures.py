@@ -1,4 +1,4 @@
-"""Is every failing event counted and reported, whatever its id, its exception and its run do?"""
+"""Every failing event is counted and reported, whatever its id, its exception and its run do."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import GraphError, NotComputed, OutputArityError, PayloadError, StaleToken
-from epypes.run import attempt, gain
+from epypes.run import execute
 
 RUNS = 6  # enough that the later ones are compiled
 
@@ -47,7 +47,7 @@ def test_a_hyperparameter_inside_makes_what_depends_on_it_stale_outside(depth):
     assert nest.runner.stale == ("nested", "after")
     assert nest.runner.plan().reused == ("before",)
     assert nest.runner.plan().why["nested"] == "an input, or a hyperparameter inside it, has changed since it ran"
-    assert nest.runner.keys() == ("a", "b")
+    assert tuple(nest.runner) == ("a", "b")
     with pytest.raises(StaleToken, match=r"'d' is stale.*Call rerun\(\)"):
         nest.runner["d"]
     assert run["d"] == 11, "a Run does not change"
@@ -68,8 +68,8 @@ def test_an_equal_value_inside_makes_nothing_stale(depth):
 @pytest.mark.parametrize("depth", [1, 2])
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_change_inside_is_seen_when_the_runs_are_compiled(depth, workers, monkeypatch):
-    monkeypatch.setattr(attempt, "has_independent_steps", lambda program: True)
-    monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: workers > 1)
+    monkeypatch.setattr(execute, "has_independent_steps", lambda program: True)
+    monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: workers > 1)
     nest = Level(depth, workers=workers)
     for n in range(RUNS):
         nest.inner["n"] = n
@@ -189,7 +189,7 @@ def test_a_graph_of_functions_joins_a_pipeline_by_its_name_and_the_names_of_its_
 
 
 def test_a_pipeline_with_workers_runs_independent_functions_at_once(monkeypatch):
-    monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+    monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: True)
     barrier = threading.Barrier(2)
 
     def meet(x):

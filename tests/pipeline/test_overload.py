@@ -1,4 +1,4 @@
-"""What happens to events that come faster than they are worked off, to their age and to the memory?"""
+"""Events that come faster than they are worked off: their age, and the memory that they take."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is whoever keeps an event told what became of it?"""
+"""Events that a broker keeps are acknowledged or rejected."""
 
 from __future__ import annotations
 

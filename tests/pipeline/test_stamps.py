@@ -1,4 +1,4 @@
-"""When did what happen to an event, and who may say so in the answer?"""
+"""The times of an event, and the failures of one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does everything that was started stop, whoever asks, whenever, and can it be started again?"""
+"""Everything that was started stops, from any thread, at any time, and can be started again."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
-from epypes.run import attempt, compiled, gain
+from epypes.run import execute
 
 pytestmark = [pytest.mark.slow, pytest.mark.fuzz]
 
@@ -165,8 +165,8 @@ def test_no_function_spoils_what_another_reads_nor_an_earlier_run(way):
         assert text([*payload.values()]) == before
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled, "_RUNS_BEFORE", 0 if way == "compiled" else 10_000)
+        patch.setattr(execute, "RUNS_BEFORE", 0 if way == "compiled" else 10_000)
         if way == "in threads":
-            patch.setattr(attempt, "has_independent_steps", lambda program: True)
-            patch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+            patch.setattr(execute, "has_independent_steps", lambda program: True)
+            patch.setattr(execute.Gain, "is_worth_it", lambda self: True)
         check()

@@ -23,12 +23,9 @@ from hypothesis.stateful import (
 
 import epypes as ep
 from epypes.errors import NotComputed, PayloadError, PlaceholderNeeded
-from epypes.run import attempt, compiled, gain
-from epypes.run.call import StepFailed
-from epypes.run.draft import Draft
-from epypes.run.engine import execute
-from epypes.run.parallel import execute_side_by_side
+from epypes.run import execute
 from epypes.run.program import Program
+from epypes.run.staleness import TokenManager
 
 NOTHING = object()
 VALUES = st.integers(0, 4)
@@ -298,12 +295,12 @@ class Machine(RuleBasedStateMachine):
 @pytest.mark.fuzz
 @pytest.mark.parametrize("way", ["the loop", "compiled at once", "in threads"])
 def test_after_any_edits_what_is_read_equals_a_run_from_scratch_and_nothing_runs_in_vain(way, monkeypatch):
-    monkeypatch.setattr(compiled, "_RUNS_BEFORE", 0 if way == "compiled at once" else 10_000)
+    monkeypatch.setattr(execute, "RUNS_BEFORE", 0 if way == "compiled at once" else 10_000)
     Machine.workers = 1
     if way == "in threads":
         Machine.workers = 2
-        monkeypatch.setattr(attempt, "has_independent_steps", lambda program: True)
-        monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+        monkeypatch.setattr(execute, "has_independent_steps", lambda program: True)
+        monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: True)
     run_state_machine_as_test(Machine, settings=settings())
 
 
@@ -319,12 +316,12 @@ def test_side_by_side_ends_as_one_after_another(graph, data):
         for slot, token in enumerate(cg.tokens)
     ]
     ends = []
-    for run in (execute, lambda *args: execute_side_by_side(*args, 3)):
-        draft, durations = Draft.of_sources(program, values.copy(), True), {}
-        failed = None
+    for run in (execute.run_one_by_one, lambda *args: execute.SideBySide(*args, 3).run()):
+        tokens = TokenManager.from_scratch(program, values.copy(), True)
+        durations, failed = {}, None
         try:
-            run(draft, None, durations)
-        except StepFailed as step_failed:
-            failed = step_failed.place
-        ends.append((draft.values, bytes(draft.dirty), set(durations), failed))
+            run(tokens, None, durations)
+        except ArithmeticError:
+            failed = tokens.running
+        ends.append((tokens.values, bytes(tokens.dirty), set(durations), failed))
     assert ends[0] == ends[1]

@@ -1,4 +1,4 @@
-"""In which ways can a graph be run?"""
+"""The ways in which a graph can be run: step by step, compiled, side by side."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import contextlib
 import pytest
 
 import epypes as ep
-from epypes.run import attempt, compiled, gain
+from epypes.run import execute
 
 # Enough that the later ones are compiled.
 RUNS = 6
@@ -26,19 +26,14 @@ class Way:
     @contextlib.contextmanager
     def is_taken(self):
         """What is run within goes this way."""
-        names = {
-            "execute": "step by step",
-            "execute_from_scratch": "step by step",
-            "execute_side_by_side": "side by side",
-        }
         found = []
 
-        def noting(function):
-            return lambda *args: (found.append(names[function.__name__]), function(*args))[1]
+        def noting(name, function):
+            return lambda *args: (found.append(name), function(*args))[1]
 
         with self._monkeypatch.context() as patch:
-            for name in names:
-                patch.setattr(attempt, name, noting(getattr(attempt, name)))
+            patch.setattr(execute, "run_one_by_one", noting("step by step", execute.run_one_by_one))
+            patch.setattr(execute.SideBySide, "run", noting("side by side", execute.SideBySide.run))
             yield
         assert found == [name for name in (self.name,) if name != "compiled"]
 
@@ -47,8 +42,8 @@ class Way:
 def way(request, monkeypatch):
     """Every run of the test goes this way; of compiled ones, those that were repeated."""
     if request.param == "step by step":
-        monkeypatch.setattr(compiled, "_RUNS_BEFORE", 10_000)
+        monkeypatch.setattr(execute, "RUNS_BEFORE", 10_000)
     if request.param == "side by side":
-        monkeypatch.setattr(attempt, "has_independent_steps", lambda program: True)
-        monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+        monkeypatch.setattr(execute, "has_independent_steps", lambda program: True)
+        monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: True)
     return Way(request.param, monkeypatch)

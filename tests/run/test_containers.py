@@ -463,3 +463,65 @@ def test_values_are_never_seen_half_written_by_a_run_in_another_thread():
             assert [each.result() for each in found] == [{1}] * 4
     finally:
         sys.setswitchinterval(interval)
+
+
+# -- a run that is compiled for the types of values that the runs before had ----------------------------------------
+
+KEPT_ARRAY, KEPT_LIST = np.zeros(80), [0] * 40
+OF_EVERY_TYPE = {
+    "array": lambda: np.zeros(40),
+    "view of a new array": lambda: np.zeros((5, 8)).reshape(40),
+    "view of a kept array": lambda: KEPT_ARRAY[:40],
+    "list": lambda: [0] * 40,
+    "list of arrays": lambda: [np.zeros(40) for _ in range(40)],
+    "kept list": lambda: KEPT_LIST,
+    "tuple": lambda: (0,) * 40,
+    "tuple of arrays": lambda: tuple(np.zeros(40) for _ in range(40)),
+    "number": lambda: 0,
+}
+
+
+def first_array(value):
+    return value if isinstance(value, np.ndarray) else value[0] if isinstance(value, list | tuple) else None
+
+
+def spoil(value):
+    """Write into a value, and into the first array in it."""
+    with contextlib.suppress(ValueError, TypeError):
+        value[0] = 7
+    with contextlib.suppress(ValueError, TypeError):
+        first_array(value)[0] = 7
+    return True
+
+
+def content(value):
+    parts = value if isinstance(value, list | tuple) else [value]
+    return type(value), [np.asarray(part).tolist() for part in parts]
+
+
+@pytest.mark.parametrize("before", OF_EVERY_TYPE)
+@pytest.mark.parametrize("outputs", ["made", ("made", "also")])
+def test_values_of_other_types_than_in_the_runs_before_are_guarded_as_well(way, before, outputs):
+    def make(kind):
+        made = OF_EVERY_TYPE[kind]()
+        return made if outputs == "made" else (made, OF_EVERY_TYPE[kind]())
+
+    runner = way.runner(
+        graph_of(
+            make=(make, "kind", outputs),
+            spoil=(spoil, "given", "one"),
+            spoil_made=(lambda made, k: spoil(made), ("made", "k"), "two"),
+            see=(lambda given, made, k: (content(given), content(made)), ("given", "made", "k"), "seen"),
+        ),
+        {"k": 0},
+    )
+    runs = []
+    for kind in [before] * way.runs + [*OF_EVERY_TYPE]:
+        given = OF_EVERY_TYPE[kind]()
+        run = runner.run(kind=kind, given=given)
+        expected = content(OF_EVERY_TYPE[kind]())
+        assert run["seen"][1] == expected
+        assert runner.rerun(k=len(runs) + 1)["seen"][1] == expected
+        runs.append((run, expected))
+    for run, expected in runs:
+        assert content(run["made"]) == expected

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.run import compiled
+from epypes.run import execute
 
 RUNS = 6  # enough that the later ones are compiled
 
@@ -187,7 +187,7 @@ def test_threads_that_share_an_array_with_an_unguarded_function_get_it_writable(
 
 @pytest.mark.parametrize("way", ["the loop", "compiled"])
 def test_writing_in_place_fails_at_the_line_however_the_function_is_called(way, monkeypatch):
-    monkeypatch.setattr(compiled, "_RUNS_BEFORE", 0 if way == "compiled" else 10_000)
+    monkeypatch.setattr(execute, "RUNS_BEFORE", 0 if way == "compiled" else 10_000)
 
     def draw(image):
         image[0] = 1

@@ -47,7 +47,7 @@ for workers in (1, 2):
     for value in range(6):
         run = runner.run(**dict.fromkeys(runner.free_source_tokens, value))
         runner.rerun(omega=value, psi=value)
-    print(list(run.items()), run.report.ran, runner.keys(), list(runner.last))
+    print(list(run.items()), run.report.ran, list(runner.keys()), list(runner.last))
     for changes in (dict(method="l"), dict(nu=4), dict(omega=7, nu=5)):
         for token, value in changes.items():
             runner[token] = value

@@ -9,7 +9,7 @@ import threading
 import pytest
 
 import epypes as ep
-from epypes.run import gain
+from epypes.run import execute
 
 # Functions that take time without computing wait for a device that never answers.
 WAIT_S = 0.02
@@ -19,7 +19,7 @@ device = threading.Event()
 @pytest.fixture
 def always(monkeypatch):
     """Threads are used wherever functions are independent, without trying whether it is faster."""
-    monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+    monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: True)
 
 
 def fork(count, function):
@@ -169,7 +169,7 @@ def test_threads_are_given_up_where_they_are_slower():
 
 @pytest.mark.slow
 def test_threads_are_tried_when_functions_become_long_later(monkeypatch):
-    monkeypatch.setattr(gain, "_LOOK_AGAIN_AFTER", 4)
+    monkeypatch.setattr(execute, "LOOK_AGAIN_AFTER", 4)
 
     def wait(seconds):
         device.wait(seconds)
@@ -200,8 +200,8 @@ def test_the_interpreter_exits_while_a_function_never_returns_on_another_thread(
     code = """
 import threading
 import epypes as ep
-from epypes.run import gain
-gain.Gain.is_worth_it = lambda self: True
+from epypes.run import execute
+execute.Gain.is_worth_it = lambda self: True
 started = threading.Event()
 main = threading.main_thread()
 def f(x):

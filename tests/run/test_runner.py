@@ -215,7 +215,7 @@ def test_a_stale_token_is_not_read(chain):
     with pytest.raises(StaleToken, match=r"'c' is stale.*Call rerun\(\) first"):
         runner["c"]
     assert runner["a"] == 4
-    assert runner.keys() == ("x", "a", "n")
+    assert tuple(runner.keys()) == ("x", "a", "n")
     assert run["c"] == 25, "a Run does not change"
     assert runner.rerun()["c"] == 81
 

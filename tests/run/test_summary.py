@@ -19,8 +19,8 @@ CHAIN = ep.CompGraph(
 def report_of(durations_ns, total_ns=10_000, cg=CHAIN, side_by_side=False, failed=None):
     """A report with these times by function, of a run in which a function may have failed."""
     places = {name: place for place, name in enumerate(cg.functions)}
-    by_place = {places[name]: duration for name, duration in durations_ns.items()}
-    return ep.RunReport(Program(cg, True), None, by_place, total_ns, side_by_side, places.get(failed, -1))
+    by_step = {places[name]: duration for name, duration in durations_ns.items()}
+    return ep.RunReport(Program(cg, True), None, by_step, total_ns, side_by_side, places.get(failed, -1))
 
 
 def test_the_fit_is_the_one_of_maximum_likelihood():

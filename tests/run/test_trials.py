@@ -1,4 +1,4 @@
-"""Can values be tried without changing the runner, and then be taken over in one step?"""
+"""Values are tried without changing the runner, and then taken over in one step."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ import pytest
 
 import epypes as ep
 from epypes.errors import HyperparameterError, PayloadError, StaleToken, UnknownName
+from epypes.run import execute
+
+RUNS = 6  # enough that the later ones are compiled
 
 
 @pytest.fixture
@@ -213,3 +216,20 @@ def test_a_watcher_that_fails_spoils_no_run(runner: ep.CompGraphRunner, caplog: 
     with caplog.at_level(logging.ERROR):
         assert runner.rerun(k=1)["b"] == 3
     assert "ZeroDivisionError" in caplog.text
+
+
+@pytest.mark.parametrize("targets", [(), ("b",)], ids=["all", "one target"])
+def test_a_trial_that_is_repeated_is_compiled_like_a_rerun(
+    runner: ep.CompGraphRunner, targets: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for k in range(20, 20 + RUNS):
+        runner.adopt(runner.trial({"k": k}, *targets))
+    monkeypatch.setattr(execute, "run_one_by_one", lambda *args: pytest.fail("was not compiled"))
+    trial = runner.trial({"k": 40}, *targets)
+    assert trial["b"] == 42
+    assert runner.adopt(trial)
+    assert runner.rerun(*targets, k=41)["b"] == 43
+    failed = runner.trial({"k": 13}, *targets)
+    assert failed.failure is not None
+    assert failed.failure.function == "add"
+    assert "b" not in failed

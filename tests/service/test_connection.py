@@ -12,8 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError
-from epypes.graph import colour_order
-from epypes.graph.hinted import annotated_params
+from epypes.graph import annotated_params, colour_order
 from epypes.service.state_file import StateLock
 from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
 from tests.service.served import until

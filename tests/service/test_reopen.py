@@ -84,7 +84,7 @@ def test_a_worker_that_was_killed_by_somebody_else_leaves_a_runner_with_the_payl
     with pytest.warns(UserWarning, match="not known in which function, so none was run"):
         runner = ep.load_failure(failure, bright_bundle)
     assert runner.last.failure is None
-    assert runner.keys() == ("image", "by", "most")
+    assert tuple(runner) == ("image", "by", "most")
     assert runner.rerun("bright")["bright"].max() == 21
 
 

@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterator
 from typing import Any, Final
 
-from epypes.graph import CompGraph
-from epypes.graph.redefined import unwrapped
+from epypes.graph import CompGraph, unwrapped
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.guesses import Taker, takers
 from epypes_widgets.ranges import described

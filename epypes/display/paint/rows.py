@@ -19,7 +19,7 @@ from epypes.display.views.times import (
     summary_caption,
 )
 from epypes.run import FunctionTime, LogNormal, Plan, RunReport, TimingSummary, summarize
-from epypes.run.report import Reports
+from epypes.run.timing import Reports
 from epypes.wording import counted
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.

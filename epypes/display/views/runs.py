@@ -11,7 +11,7 @@ from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
 from epypes.display.views.tokens import ROOM, Room, token_view, with_run_values
 from epypes.run import FunctionTime, Run
-from epypes.run.need import chosen_branches, wanted_steps
+from epypes.run.plan import chosen_branches, wanted_steps
 
 
 def run_structure(run: Run) -> GraphView:

@@ -14,8 +14,7 @@ from weakref import WeakKeyDictionary
 
 from epypes.display.previews.preview import preview
 from epypes.display.previews.short import without_addresses
-from epypes.graph import CompGraph
-from epypes.graph.redefined import unwrapped
+from epypes.graph import CompGraph, unwrapped
 
 SIGNATURE_CHARACTERS: Final = 200
 SOURCE_LINES: Final = 30

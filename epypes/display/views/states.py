@@ -10,7 +10,7 @@ from epypes.display.markup import short_name
 from epypes.display.previews.preview import preview
 from epypes.display.views.graphview import GraphView, TokenView
 from epypes.display.views.structure import with_caption
-from epypes.run.tokens import is_same_value
+from epypes.run.staleness import is_same_value
 
 _NAMED: Final = 8
 

@@ -10,8 +10,7 @@ from epypes.display.markup import cut
 from epypes.display.previews.preview import preview
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
 from epypes.display.views.source import graph_lines, signature_and_source
-from epypes.graph import CompGraph, Switch, as_switch, colour_order
-from epypes.graph.redefined import inner_graph, is_redefined_inside, redefined
+from epypes.graph import CompGraph, Switch, as_switch, colour_order, inner_graph, is_redefined_inside, redefined
 from epypes.wording import counted
 
 TO_BE_WRITTEN: Final = "to be written"

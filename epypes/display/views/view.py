@@ -19,8 +19,7 @@ from epypes.display.views.states import with_first, with_running
 from epypes.display.views.structure import structure_of, with_caption
 from epypes.display.views.tokens import Room, valueless_view, with_values
 from epypes.errors import UnknownName
-from epypes.graph import CompGraph
-from epypes.graph.renaming import names_of
+from epypes.graph import CompGraph, names_of
 from epypes.run import CompGraphRunner, Plan, Run
 
 # What is left to thumbnails, however many vertices are seen twice.

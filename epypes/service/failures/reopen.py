@@ -12,7 +12,7 @@ from typing import Any, Final
 from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.errors import RemoteFailure
 from epypes.run import CompGraphRunner
-from epypes.run.stopped import stop_at
+from epypes.run.runner import stop_at
 from epypes.service.failures.record import FailedEvent, values_of
 from epypes.service.failures.reproduce import reproduce
 from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of

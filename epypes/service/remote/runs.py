@@ -18,7 +18,7 @@ from epypes.graph import CompGraph, colour_order, subgraph
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run import Failure, Run
-from epypes.run.imported import RunImporter
+from epypes.run.result import RunImporter
 from epypes.service.parameters import Parameters
 
 if TYPE_CHECKING:

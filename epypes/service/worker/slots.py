@@ -23,8 +23,6 @@ from epypes.bundle.load import Bundle, pipeline_of
 from epypes.bundle.settings import Member, decode_value
 from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline
-from epypes.pipeline.answering import Answering
-from epypes.pipeline.reactive import SinkPipeline
 from epypes.run import Failure, Run
 from epypes.service.frame_socket import FrameSocket, WorkerMessage
 from epypes.service.packing import BytesLike
@@ -236,8 +234,8 @@ def _answer(item: Any, stamp: Mapping[str, Any]) -> list[BytesLike]:
 def _puts_last(pipeline: FullPipeline) -> bool:
     """Whether a pipeline has finished with an event when it has put its answer."""
     kind = type(pipeline)
-    own: Mapping[str, Any] = {"handle": SinkPipeline.handle, "emit": Answering.emit, "put": Answering.put}
-    return all(getattr(kind, name) is hook for name, hook in own.items())
+    own = ("handle", "emit", "put")
+    return all(getattr(kind, name) is getattr(FullPipeline, name) for name in own)
 
 
 def _describe_failure(failure: Failure) -> dict[str, Any]:

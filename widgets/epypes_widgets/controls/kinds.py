@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from epypes.run.tokens import is_same_value
+from epypes.run.staleness import is_same_value
 
 
 def kept_type(value: Any) -> type | None:

@@ -1,30 +1,242 @@
-"""How long do the functions of a graph take over many runs?
+"""Times of runs: the report of one, the reports that a runner keeps, and the summary of many.
 
-Durations are skewed: most are near the shortest possible, a few are much longer. So they are described by log-normal
-distributions, fitted by maximum likelihood. Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, figures 15
-and 16.
+Durations are skewed: most are near the shortest possible, a few are much longer. So many of them are described by
+log-normal distributions, fitted by maximum likelihood. Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176,
+figures 15 and 16.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from array import array
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist, fmean
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, overload
 
 from epypes.optional import optional_import
-from epypes.run.report import RunReport
+from epypes.run.program import Program
 from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
 
+# The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side, the
+# step that failed (-1 if none did). A RunReport is made of them when it is read. Durations of large graphs are packed:
+# one for every step, -1 for those that did not run.
+Durations = dict[int, int] | Sequence[int]
+Times = tuple[Program, bytes | None, Durations, int, bool, int]
+
+KEPT: Final = 1_000
+# Packed above that: a thousand reports would hold a gigabyte of integers.
+_MAX_UNPACKED: Final = 400
+_COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed")
+_SUMMARY_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
 _STANDARD: Final = NormalDist()
-_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
 # Fewer durations say nothing of the tails: two that differ by a factor of 3 would get a range of a factor of 6.
 _FEWEST_WITH_RANGE: Final = 5
+
+
+def longest_path_ns(program: Program, durations_ns: Mapping[int, int]) -> int:
+    """Return how long those functions take that need each other's outputs one after another, at most."""
+    ends_ns: dict[int, int] = {}
+    for place in sorted(durations_ns):
+        makers = [program.makers[slot] for slot in program.steps[place].inputs]
+        ends_ns[place] = durations_ns[place] + max((ends_ns.get(maker, 0) for maker in makers), default=0)
+    return max(ends_ns.values(), default=0)
+
+
+@dataclass(frozen=True, slots=True)
+class FunctionTime:
+    """How long one function took.
+
+    Attributes
+    ----------
+    duration_ns
+        In nanoseconds; of a function that failed until it raised, of one that was reused 0.
+    ran
+        Whether it was called, to whatever end; if not, it was reused.
+    failed
+        Whether it raised.
+    """
+
+    function: str
+    duration_ns: int
+    ran: bool
+    failed: bool = False
+
+
+class RunReport:
+    """The times of one run; does not change.
+
+    Attributes
+    ----------
+    total_ns
+        From the start of the run to its end, in nanoseconds.
+    side_by_side
+        Whether functions may have run side by side.
+    ran_ns
+        Nanoseconds by step that ran.
+    """
+
+    __slots__ = ("_failed_at", "_program", "_wanted", "ran_ns", "side_by_side", "total_ns")
+
+    def __init__(
+        self,
+        program: Program,
+        wanted: bytes | None,
+        durations_ns: Durations,
+        total_ns: int,
+        side_by_side: bool = False,
+        failed_at: int = -1,
+    ) -> None:
+        self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
+        self._failed_at = failed_at
+        if not isinstance(durations_ns, dict):
+            durations_ns = {place: duration for place, duration in enumerate(durations_ns) if duration >= 0}
+        self.ran_ns = durations_ns
+
+    @property
+    def program(self) -> Program:
+        """What was run."""
+        return self._program
+
+    @property
+    def functions(self) -> tuple[FunctionTime, ...]:
+        """One entry per function that the run needed, in run order; of a failed run those it came to."""
+        ran_ns, wanted, failed_at = self.ran_ns, self._wanted, self._failed_at
+        return tuple(
+            FunctionTime(step.name, ran_ns.get(step.place, 0), step.place in ran_ns, step.place == failed_at)
+            for step in self._program.steps
+            if wanted is None or wanted[step.place] or step.place in ran_ns
+        )
+
+    @property
+    def durations_ns(self) -> dict[str, int]:
+        """Nanoseconds by function that ran, in run order; of one that failed until it raised."""
+        return {self._program.steps[place].name: self.ran_ns[place] for place in sorted(self.ran_ns)}
+
+    @property
+    def ran(self) -> tuple[str, ...]:
+        """The functions that ran, with the one that failed."""
+        return tuple(self.durations_ns)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every function of the graph ran, and none failed."""
+        return self._failed_at < 0 and len(self.ran_ns) == len(self._program.steps)
+
+    @property
+    def failed(self) -> str | None:
+        """The function that failed, or None."""
+        return None if self._failed_at < 0 else self._program.steps[self._failed_at].name
+
+    @property
+    def reused(self) -> tuple[str, ...]:
+        """The functions whose outputs were still up to date."""
+        return tuple(entry.function for entry in self.functions if not entry.ran)
+
+    @property
+    def critical_path_ns(self) -> int:
+        """The longest time that functions which need each other's outputs took one after another, in nanoseconds."""
+        return longest_path_ns(self._program, self.ran_ns)
+
+    @property
+    def overhead_ns(self) -> int:
+        """The graph overhead (the paper's o_cg), in nanoseconds.
+
+        The total less the functions' times; where they run side by side, the total less the critical path. That
+        includes the waiting for a free worker.
+        """
+        if self.side_by_side:
+            return self.total_ns - self.critical_path_ns
+        return self.total_ns - sum(self.ran_ns.values())
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table: function, ran, time_ms, share (of the total), failed.
+
+        A function that failed has ``ran`` true as well, and the time until it raised.
+        """
+        with optional_import():
+            import pandas as pd
+
+        return pd.DataFrame(self._rows(), columns=list(_COLUMNS))
+
+    def _rows(self) -> list[tuple[str, bool, float, float, bool]]:
+        """Return what ``to_frame`` has as rows."""
+        total_ns = max(self.total_ns, 1)
+        return [
+            (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / total_ns, entry.failed)
+            for entry in self.functions
+        ]
+
+    def __repr__(self) -> str:
+        failed = self._failed_at >= 0
+        ran = len(self.ran) - failed
+        return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{', 1 failed' * failed}>"
+
+    def __str__(self) -> str:
+        from epypes.display import to_text
+
+        return to_text(self)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
+
+
+class Reports(Sequence[RunReport]):
+    """The reports of a runner's last 1,000 runs, the oldest first; without the values of their tokens."""
+
+    def __init__(self) -> None:
+        self.kept: deque[Times] = deque(maxlen=KEPT)
+
+    def add(self, times: Times) -> None:
+        """Keep the times of one more run."""
+        durations_ns = times[2]
+        if len(durations_ns) > _MAX_UNPACKED and isinstance(durations_ns, dict):
+            packed = array("q", [durations_ns.get(step.place, -1) for step in times[0].steps])
+            times = (*times[:2], packed, *times[3:])
+        self.kept.append(times)
+
+    @overload
+    def __getitem__(self, index: int) -> RunReport: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[RunReport]: ...
+    def __getitem__(self, index: int | slice) -> RunReport | list[RunReport]:
+        if isinstance(index, slice):
+            return [RunReport(*times) for times in list(self.kept)[index]]
+        return RunReport(*self.kept[index])
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total), failed."""
+        with optional_import():
+            import pandas as pd
+
+        rows = [(place, *row) for place, report in enumerate(self) for row in report._rows()]
+        return pd.DataFrame(rows, columns=["run", *_COLUMNS])
+
+    def __iter__(self) -> Iterator[RunReport]:
+        return (RunReport(*times) for times in tuple(self.kept))
+
+    def __repr__(self) -> str:
+        return f"<Reports of {counted(len(self), 'run')}>"
+
+    def __str__(self) -> str:
+        from epypes.display import to_text
+
+        return to_text(self)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +376,7 @@ class TimingSummary:
             import pandas as pd
 
         rows = (*self.functions.items(), ("total", self.total), ("graph overhead", self.overhead))
-        return pd.DataFrame([_row(name, fitted) for name, fitted in rows], columns=list(_COLUMNS))
+        return pd.DataFrame([_row(name, fitted) for name, fitted in rows], columns=list(_SUMMARY_COLUMNS))
 
     def __repr__(self) -> str:
         functions = len(self.functions)

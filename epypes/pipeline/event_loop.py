@@ -1,53 +1,121 @@
-"""The thread that takes events from a queue, and its end."""
+"""The thread that takes events from a queue, and the settling of events that a broker keeps.
+
+An event that a broker keeps has ``ack``, ``reject`` and ``nack``. They are looked up in its class, so that events can
+be anything.
+"""
 
 from __future__ import annotations
 
 import atexit
+import logging
 import queue
 import threading
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
-from typing import Any
+from typing import Any, Final
 
-from epypes.errors import StillRunning
-from epypes.pipeline.log import log_error
-from epypes.pipeline.settling import settle
+from epypes.errors import BrokerError, StillRunning
+from epypes.pipeline.pipeline import Pipeline
 
 # How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
 # woken without putting a sentinel into them, which would be an event of theirs.
-POLL_S = 0.05
+POLL_S: Final = 0.05
 # Of a queue that has been empty for a while: to wake up takes up to 100 us of a core.
-LONGEST_POLL_S = 0.2
+LONGEST_POLL_S: Final = 0.2
+
+_log: Final = logging.getLogger("epypes.pipeline")
 
 _left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
 
 
-class EventLoop:
-    """A daemon thread that takes events from a queue and, for each, calls ``callback(**f_in(event))``.
+def log_error(text: str, *parts: object, error: BaseException | None) -> None:
+    """Log an error with its traceback, or without, if the exception does not let itself be shown."""
+    try:
+        _log.error(text, *parts, exc_info=error)
+    except BaseException:  # a SystemExit of its __notes__ passes through logging, and would end the thread
+        _log.error(f"{text} (its traceback can't be had)", *parts)
 
-    Without f_in it calls ``callback(event)``.
+
+def is_kept(event: Any) -> bool:
+    """Whether a broker keeps an event until it is acknowledged or rejected."""
+    return getattr(type(event), "ack", None) is not None
+
+
+def settle(event: Any, error: BaseException | None = None, text: str = "") -> None:
+    """Acknowledge, reject or return an event that has such methods; raises nothing.
+
+    Parameters
+    ----------
+    event
+        Any object.
+    error
+        Why it failed; None if it did not. After a BrokerError the outcome is unknown: ``nack`` is called if the event
+        has it, and otherwise nothing, so that the broker delivers it again.
+    text
+        The reason it is rejected with; that of the error without.
+    """
+    kind = type(event)
+    if not is_kept(event):
+        return
+    if error is None:
+        _call(kind.ack, event)
+    elif issubclass(type(error), BrokerError):
+        if hasattr(kind, "nack"):
+            _call(kind.nack, event)
+    else:
+        reject(event, text or _text_of(error))
+
+
+def reject(event: Any, reason: str) -> None:
+    """Reject an event with a reason, if its class has the method; raises nothing."""
+    found = getattr(type(event), "reject", None)
+    if found is not None:
+        _call(found, event, reason)
+
+
+def _call(method: Any, event: Any, *reason: str) -> None:
+    try:
+        method(event, *reason)
+    except KeyboardInterrupt:  # the user's, which does not concern the event
+        raise
+    except BaseException as exception:
+        log_error("an event could not be settled", error=exception)
+
+
+def _text_of(error: BaseException) -> str:
+    kind = type(error).__name__
+    try:
+        return f"{kind}: {error}"
+    except BaseException:  # an exception's own __str__ may raise
+        return kind
+
+
+class EventLoop:
+    """A daemon thread that takes events from a queue and, for each, runs a pipeline or calls a function.
+
+    With a Pipeline it calls ``callback.run(**f_in(event))``, or ``callback.handle(event)`` of one that reacts to events
+    itself (SinkPipeline, FullPipeline); with any other function ``callback(**f_in(event))``. Without f_in it calls
+    ``callback(event)``.
 
     Parameters
     ----------
     q_in
         Anything with ``get(timeout=seconds)`` that raises ``queue.Empty``: queue.Queue, queue.SimpleQueue, Mailbox.
     callback
-        Called on the loop's thread.
+        A Pipeline, or a function; called on the loop's thread. A SinkPipeline or FullPipeline answers the event and
+        reports its failures as when it listens itself.
     f_in
         Makes the callback's keyword arguments from an event. Events can be anything, arrays and None included.
-        Without it the callback takes the event itself. One whose class has ``ack`` and ``reject``, as a broker's has,
-        is told so when the callback has returned, or raised; after a BrokerError it is left to be delivered again.
+        Without it the callback takes the event itself. An event of a broker, whose class has ``ack`` and ``reject``, is
+        acknowledged when the callback has returned, and rejected when it raised; after a BrokerError the broker
+        delivers it again.
     on_error
         Called with the event and the exception when f_in or the callback raises; logged without one. The loop
         goes on in any case.
     name
-        For the thread's name and for errors.
-    busy
-        Returns the functions that have not returned; for errors.
-    settle
-        Called with an event, and the exception or None, when it is over; tells whoever keeps the event.
+        For the thread's name and for errors; a pipeline's own without.
 
     Notes
     -----
@@ -61,12 +129,11 @@ class EventLoop:
         f_in: Callable[[Any], Mapping[str, Any]] | None = None,
         *,
         on_error: Callable[[Any, BaseException], None] | None = None,
-        name: str = "EventLoop",
-        busy: Callable[[], Sequence[str]] = tuple,
-        settle: Callable[[Any, BaseException | None], None] = settle,
+        name: str = "",
     ) -> None:
         self.q_in, self.callback, self.f_in, self.on_error = q_in, callback, f_in, on_error
-        self.name, self._busy, self._settle = name, busy, settle
+        self._pipeline = callback if isinstance(callback, Pipeline) else None
+        self.name = name or (self._pipeline.name if self._pipeline is not None else "EventLoop")
         self.handled = 0
         self._stop = threading.Event()
         self._draining = threading.Event()
@@ -156,19 +223,32 @@ class EventLoop:
                 stop.wait(POLL_S)
                 continue
             try:
-                if self.f_in is None:
-                    self.callback(event)
-                else:
-                    self.callback(**self.f_in(event))
+                self._handle(event)
             except BaseException as exception:  # a function's SystemExit must not end the thread in silence
                 self._report(event, exception)
                 self._settle(event, exception)
             else:
-                self._settle(event, None)
+                if is_kept(event):
+                    self._settle(event, None)
             poll_s = POLL_S
             # An event may be large: it shall not live on until another comes.
             del event
             self.handled += 1
+
+    def _handle(self, event: Any) -> None:
+        if self._pipeline is not None:
+            self._pipeline._react(event, self.f_in)
+        elif self.f_in is None:
+            self.callback(event)
+        else:
+            self.callback(**self.f_in(event))
+
+    def _settle(self, event: Any, exception: BaseException | None) -> None:
+        if self._pipeline is None or not self._pipeline._has_settled(event):
+            settle(event, exception)
+
+    def _busy(self) -> Sequence[str]:
+        return self._pipeline._busy if self._pipeline is not None else ()
 
     def _is_drained(self, stop: threading.Event) -> bool:
         """Whether the loop ends now that the queue is empty; from then on it counts as stopped."""

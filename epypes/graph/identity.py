@@ -1,17 +1,50 @@
-"""Functions of a graph that are no longer what their name says, since their cell was run again."""
+"""Identity of functions: what they wrap, whether two are the same, and whether one was redefined since."""
 
 from __future__ import annotations
 
 import sys
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
 
-# A wrapper may wrap itself by mistake; nobody wraps this deep on purpose.
+# A mock object wraps itself without end, and no function is wrapped this deep on purpose.
 _DEEPEST: Final = 100
-_SAID_OF_PARAMETERS: Final = ("__defaults__", "__kwdefaults__", "__annotations__")
+
+
+def innermost(function: object) -> object:
+    """Follow ``__wrapped__`` to the function that a node or a decorator wraps, which is called in the same way."""
+    for _ in range(_DEEPEST):
+        try:
+            function = vars(function)["__wrapped__"]
+        except Exception:  # it has no attributes, it wraps nothing, or it raises when it is looked at
+            break
+    return function
+
+
+def unwrapped(function: Any) -> Any:
+    """Return the Python function in a decorated one, a node, a partial or a method."""
+    for _ in range(_DEEPEST):
+        names = ("__wrapped__", "__func__", "func")
+        inner = next((found for name in names if callable(found := getattr(function, name, None))), None)
+        if inner is None:
+            break
+        function = inner
+    return function
+
+
+def inner_graph(function: Any) -> CompGraph | None:
+    """Return the graph that a pipeline runs, None for anything else. Never raises."""
+    if type(function) is FunctionType:
+        return None
+    from epypes.graph.compgraph import CompGraph
+
+    try:
+        inner = getattr(function, "cg", None)
+        return inner if isinstance(inner, CompGraph) else None
+    except Exception:  # whatever an object's __getattr__ raises
+        return None
 
 
 def redefined(cg: CompGraph) -> tuple[str, ...]:
@@ -22,7 +55,7 @@ def redefined(cg: CompGraph) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> from epypes.graph.compgraph import CompGraph
+    >>> from epypes.graph import CompGraph
     >>> redefined(CompGraph({"f": lambda x: x}, {"f": ("x", "y")}))
     ()
     """
@@ -43,41 +76,9 @@ def _is_redefined(function: Any) -> bool:
         if not isinstance(old, FunctionType):
             return False
         new = unwrapped(_bound_now(old.__module__, old.__qualname__))
-        return isinstance(new, FunctionType) and new is not old and not is_defined_alike(old, new)
+        return isinstance(new, FunctionType) and new is not old and not _is_defined_alike(old, new)
     except Exception:  # a repr shows this; whatever odd objects do, it must not fail
         return False
-
-
-def inner_graph(function: Any) -> CompGraph | None:
-    """Return the graph that a pipeline runs, None for anything else. Never raises."""
-    if type(function) is FunctionType:
-        return None
-    from epypes.graph.compgraph import CompGraph
-
-    try:
-        inner = getattr(function, "cg", None)
-        return inner if isinstance(inner, CompGraph) else None
-    except Exception:  # whatever an object's __getattr__ raises
-        return None
-
-
-def unwrapped(function: Any) -> Any:
-    """Return the Python function in a decorated one, a node, a partial or a method."""
-    for _ in range(_DEEPEST):
-        if type(function) is FunctionType and not function.__dict__:
-            break
-        inner = next(
-            (found for name in ("__wrapped__", "__func__", "func") if (found := _attribute(function, name))), None
-        )
-        if inner is None:
-            break
-        function = inner
-    return function
-
-
-def _attribute(function: Any, name: str) -> Any:
-    found = getattr(function, name, None)
-    return found if callable(found) else None
 
 
 def _bound_now(module: str, qualname: str) -> Any:
@@ -90,6 +91,14 @@ def _bound_now(module: str, qualname: str) -> Any:
     return found
 
 
+def is_same_function(left: Any, right: Any) -> bool:
+    """Whether two callables are one function: the same object, bound method or definition, run again unchanged."""
+    # A bound method is a new object each time it is read; two are equal if they are bound to one object.
+    if type(left) is MethodType and type(right) is MethodType:
+        return left == right
+    return left is right or (have_one_name(left, right) and _is_defined_alike(left, right))
+
+
 def have_one_name(left: object, right: object) -> bool:
     """Whether these are functions of one name in one module, as a function and its later definition are."""
     if not isinstance(left, FunctionType) or not isinstance(right, FunctionType):
@@ -97,13 +106,18 @@ def have_one_name(left: object, right: object) -> bool:
     return left.__globals__ is right.__globals__ and left.__qualname__ == right.__qualname__ != "<lambda>"
 
 
-def is_defined_alike(old: Any, new: Any) -> bool:
+def _is_defined_alike(old: FunctionType, new: FunctionType) -> bool:
     """Whether two functions were defined in the same words, defaults included, and depend on nothing around them."""
     if old.__closure__ or new.__closure__:
         return False
-    if not all(is_same_default(getattr(old, name), getattr(new, name)) for name in _SAID_OF_PARAMETERS):
-        return False
-    return old.__code__ == new.__code__ or _at_line_one(old.__code__) == _at_line_one(new.__code__)
+    declared = [(each.__defaults__, each.__kwdefaults__, each.__annotations__) for each in (old, new)]
+    return is_same_default(*declared) and _at_line_one(old.__code__) == _at_line_one(new.__code__)
+
+
+def _at_line_one(code: CodeType) -> CodeType:
+    """Return the code as if it were defined in the first line: a line more above it in the cell changes nothing."""
+    constants = tuple(_at_line_one(item) if isinstance(item, CodeType) else item for item in code.co_consts)
+    return code.replace(co_firstlineno=1, co_consts=constants)
 
 
 def is_same_default(left: Any, right: Any) -> bool:
@@ -115,7 +129,7 @@ def is_same_default(left: Any, right: Any) -> bool:
     if type(left) in (tuple, list):
         return len(left) == len(right) and all(map(is_same_default, left, right))
     if type(left) is dict:
-        return len(left) == len(right) and all(map(is_same_default, left.items(), right.items()))
+        return is_same_default(list(left.items()), list(right.items()))
     if hasattr(type(left), "tobytes") and hasattr(type(left), "dtype"):
         # An array: NumPy is not imported here.
         same = left.dtype == right.dtype and left.shape == right.shape and not left.dtype.hasobject
@@ -125,9 +139,3 @@ def is_same_default(left: Any, right: Any) -> bool:
         return repr(left) == repr(right) and (bool(left == right) or bool(left != left))
     except Exception:  # whatever an object's own comparison raises
         return False
-
-
-def _at_line_one(code: CodeType) -> CodeType:
-    """Return the code as if it were defined in the first line: a line more above it in the cell changes nothing."""
-    constants = tuple(_at_line_one(item) if isinstance(item, CodeType) else item for item in code.co_consts)
-    return code.replace(co_firstlineno=1, co_consts=constants)

@@ -1,0 +1,697 @@
+"""Running steps: compiled where a run repeats, one by one otherwise, in threads where the last times say that they pay.
+
+All three ways change one `TokenManager` and one list of durations by step, so what is left of a run that fails is the
+same in each. The step that is being run is written down before its inputs are read.
+"""
+
+from __future__ import annotations
+
+import heapq
+import sys
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from contextvars import copy_context
+from functools import partial
+from sys import getrefcount
+from time import perf_counter_ns
+from types import BuiltinFunctionType
+from typing import Any, Final
+
+from epypes.errors import ContractBroken, InputMutated, OutputArityError
+from epypes.images import Image
+from epypes.run.guard import (
+    ARRAYLESS,
+    FRESH,
+    FRESH_HERE,
+    FRESH_OWNER,
+    HARMLESS,
+    LONG,
+    array_type,
+    is_array,
+    keep,
+    lend,
+    writable,
+)
+from epypes.run.program import Program, Step
+from epypes.run.snapshot import Snapshot
+from epypes.run.staleness import TokenManager, is_unchanged
+from epypes.run.timing import longest_path_ns
+
+# Runs its steps on values by slot and dirty flags by step (None from scratch), and writes nanoseconds by step. The step
+# that is running is an attribute of its first argument.
+CompiledRun = Callable[[Any, list[Any], bytearray | None, dict[int, int]], None]
+
+# Compiling takes some 40 us per function, once: worth it for what is repeated, and a pause below 20 ms.
+RUNS_BEFORE: Final = 3
+_MAX_STEPS: Final = 400
+_MAX_COMPILED: Final = 64
+_MAX_COUNTED: Final = 1_000
+# What threads must gain at best: the start and waking of two, and a tenth of the whole.
+_MIN_GAIN_NS: Final = 200_000
+_MIN_SHARE: Final = 0.1
+_TRIALS: Final = 3
+_TRY_AGAIN_AFTER: Final = 201
+LOOK_AGAIN_AFTER: Final = 100
+
+
+class Executor:
+    """Runs the steps of a program.
+
+    Parameters
+    ----------
+    program
+        What is run.
+    workers
+        How many steps may run at once.
+    """
+
+    def __init__(self, program: Program, workers: int) -> None:
+        self._program, self._workers = program, workers
+        self._counts: Counter[Hashable] = Counter()
+        # By plain tokens, wanted steps, steps that were dirty before, and changed source tokens.
+        self.repeated: dict[Hashable, CompiledRun] = {}
+        # Types of values by slot, as the last run had them that was not compiled.
+        self._kinds: list[type] = []
+        # Checked for changes to their inputs, functions that share one run one after another.
+        self.may_use_threads = workers > 1 and not program.check_mutation and has_independent_steps(program)
+        self._gains: dict[Hashable, Gain] = {}
+
+    def execute(
+        self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int], plain: frozenset[str],
+        changed: tuple[str, ...] = (),
+    ) -> tuple[bool, BaseException | None]:  # fmt: skip
+        """Run the dirty steps, those included that become dirty on the way.
+
+        Parameters
+        ----------
+        tokens
+            Are changed.
+        wanted
+            By step, 1 for those that may run; all of them for None.
+        durations_ns
+            Gets the nanoseconds of each step that ran.
+        plain
+            The tokens whose values hold no arrays in any run with these.
+        changed
+            The source tokens that have got new values, if tokens have been computed before.
+
+        Returns
+        -------
+        tuple
+            Whether threads were used; None, or what a function raised: that of the step ``tokens.running``.
+        """
+        key = (plain, wanted, tokens.origin, changed)
+        gain = self._gain(key) if self.may_use_threads else None
+        side_by_side = gain is not None and gain.is_worth_it()
+        self._program.running.add(tokens)
+        start_ns = perf_counter_ns()
+        try:
+            if side_by_side:
+                SideBySide(tokens, wanted, durations_ns, self._workers).run()
+            elif (compiled := self._find(key, tokens, wanted, plain, changed)) is not None:
+                compiled(tokens, tokens.values, tokens.dirty, durations_ns)
+                if tokens.origin is None:
+                    left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
+                    tokens.dirty = bytearray(left_out)
+            else:
+                run_one_by_one(tokens, wanted, durations_ns)
+                if len(self._program.steps) <= _MAX_STEPS:
+                    self._kinds = [*map(type, tokens.values)]
+        except BaseException as error:
+            return side_by_side, error
+        finally:
+            self._program.running.discard(tokens)
+        if gain is not None:
+            gain.learn(durations_ns, perf_counter_ns() - start_ns, side_by_side)
+        return side_by_side, None
+
+    def _find(
+        self, key: Hashable, tokens: TokenManager, wanted: bytes | None, plain: frozenset[str], changed: tuple[str, ...]
+    ) -> CompiledRun | None:
+        """Return the compiled run of the dirty steps; None if it has not been repeated enough."""
+        found = self.repeated.get(key)
+        if found is not None:
+            return found
+        program = self._program
+        if len(program.steps) > _MAX_STEPS or (program.switches and tokens.origin is not None):
+            return None
+        if len(self._counts) > _MAX_COUNTED:
+            self._counts.clear()
+        self._counts[key] += 1
+        if self._counts[key] <= RUNS_BEFORE:
+            return None
+        if len(self.repeated) >= _MAX_COMPILED:
+            self.repeated.clear()
+            self._counts.clear()
+        source = _Source(program, tokens, wanted, [program.slots[token] for token in plain], changed, self._kinds)
+        self.repeated[key] = made = source.compile()
+        return made
+
+    def whole(self, plain: frozenset[str]) -> CompiledRun | None:
+        """Return the compiled run of every step from scratch, if there is one that needs no look at what is wanted."""
+        is_simple = not self.may_use_threads and not self._program.switches and not self._program.placeholders
+        return self.repeated.get((plain, None, None, ())) if is_simple else None
+
+    def _gain(self, key: Hashable) -> Gain:
+        if len(self._gains) >= _MAX_COMPILED:
+            self._gains.clear()
+        return self._gains.setdefault(key, Gain(self._program, self._workers))
+
+
+_INVERTED: Final = bytes((1, 0)).ljust(256)
+
+
+# -- one call ---------------------------------------------------------------------------------------------------------
+
+
+def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict[int, int]) -> Sequence[Any]:
+    """Call a step's function on the values of its inputs; return one value per output token, guarded.
+
+    Raises
+    ------
+    OutputArityError
+        The function returned the wrong number of values.
+    ContractBroken, InputMutated, IteratorRefused
+        It does not keep to its contract, changed an object inside an input, or returned what can be read only once.
+    """
+    # Unpacked at once: to look up one field of a named tuple takes as long.
+    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node = step
+    if node is not None:
+        function = node.func
+    start_ns = 0
+    try:
+        if is_plain:
+            args = []
+            for slot in inputs:
+                value = values[slot]
+                args.append(value if type(value) in ARRAYLESS else lend(value))
+        else:
+            args = _args(program, step, values)
+            if program.check_mutation and switch is None:
+                function = partial(_call_checked, program, step, function, values)
+        start_ns = perf_counter_ns()
+        result = function(*args)
+        durations_ns[place] = perf_counter_ns() - start_ns
+        made: Sequence[Any]
+        if not single:
+            made = unpack(program, step, result, values)
+        elif type(result) in ARRAYLESS or not program.guard or switch is not None:
+            made = (result,)
+        else:
+            made = (keep(result, FRESH, program, outputs[0], values),)
+        if contracts is not None:
+            _check(program, step, contracts[1], outputs, made)
+    except BaseException:
+        durations_ns[place] = perf_counter_ns() - start_ns if start_ns else 0
+        raise
+    return made
+
+
+def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
+    """Return the inputs of a step that is not plain; a switch passes values on as they are stored."""
+    args = [values[slot] for slot in step.inputs]
+    if program.guard and step.switch is None:
+        args = [writable(arg) if step.unguarded else lend(arg) for arg in args]
+    if step.contracts is not None:
+        _check(program, step, step.contracts[0], step.inputs, args)
+    return args
+
+
+def _call_checked(program: Program, step: Step, function: Callable[..., Any], values: Sequence[Any], *args: Any) -> Any:
+    """Call a step's function; put back what it has changed of its inputs, and raise InputMutated."""
+    given = {program.tokens[slot]: values[slot] for slot in step.inputs}
+    if step.unguarded:  # which can write into memory that is locked for others
+        views = zip(step.inputs, args, strict=True)
+        given.update((program.tokens[slot], view) for slot, view in views if is_array(view))
+    before = Snapshot(given)
+    try:
+        result = function(*args)
+    except BaseException:
+        before.restore()
+        raise
+    token = before.changed()
+    if token is not None:
+        before.restore()
+        raise InputMutated(step.name, token, has_read_iterator=before.changed() is not None)
+    return result
+
+
+def _check(
+    program: Program, step: Step, contracts: Sequence[Image | None], slots: Sequence[int], values: Sequence[Any]
+) -> None:
+    """Raise ContractBroken for the first value that is not the image that the function's annotation says."""
+    for contract, slot, value in zip(contracts, slots, values, strict=False):
+        found = contract.found(value) if contract is not None else None
+        if contract is not None and found is not None:
+            raise ContractBroken(step.name, program.tokens[slot], contract, found, made=slots is step.outputs)
+
+
+def unpack(program: Program, step: Step, result: Any, values: Sequence[Any]) -> list[Any]:
+    """Return a result as one value per output token, guarded; a string or an array is not split.
+
+    Raises
+    ------
+    OutputArityError
+        It is not a tuple or list of as many values as there are output tokens.
+    """
+    if not step.outputs:
+        return []
+    got = f"one {type(result).__name__}"
+    if isinstance(result, tuple | list):
+        found = list(result)
+        if len(found) == len(step.outputs):
+            # The result, the list and the loop each hold a reference to an item; FRESH counts one of them. The items of
+            # a result that the function goes on holding are not fresh, whatever their counts say.
+            fresh_count = 0 if getrefcount(result) > FRESH else FRESH + 2
+            if not program.guard:
+                return found
+            # No zip(), which would hold a reference too.
+            slots = iter(step.outputs)
+            return [keep(item, fresh_count, program, next(slots), values) for item in found]
+        got = f"{type(result).__name__} of {len(found)}"
+    raise OutputArityError(step.name, [program.tokens[slot] for slot in step.outputs], got)
+
+
+# -- one by one -------------------------------------------------------------------------------------------------------
+
+
+def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
+    """Run the dirty steps in run order."""
+    program, values, next_dirty, store = tokens.program, tokens.values, tokens.dirty.find, tokens.store
+    steps = program.steps
+    # What depends on a step comes after it, so one pass over the flags finds everything.
+    place = next_dirty(1)
+    while place >= 0:
+        if wanted is None or wanted[place]:
+            tokens.running = place
+            step = steps[place]
+            store(step, call(program, step, values, durations_ns))
+        place = next_dirty(1, place + 1)
+
+
+# -- compiled ---------------------------------------------------------------------------------------------------------
+
+# What the source refers to besides the program and the functions.
+_NAMES: Final = {
+    "clock": perf_counter_ns,
+    "kind": type,
+    "count": getrefcount,
+    "ARRAYLESS": ARRAYLESS,
+    "HARMLESS": HARMLESS,
+    "FRESH": FRESH,
+    "lend": lend,
+    "keep": keep,
+    "call": call,
+    "unpack": unpack,
+    "is_unchanged": is_unchanged,
+}
+_FREQUENT: Final = ("clock", "kind", "count", "array", "HARMLESS")
+
+
+class _Source:
+    """The source of a repeated run, written out as one Python function.
+
+    It is made of slot and step numbers only: names and values of the user never enter it. ``v[3]`` is the value in slot
+    3, ``d[2]`` the duration of step 2, ``D[2]`` whether it is dirty, ``f2`` its function; ``c3`` whether slot 3 has got
+    a new value, ``h3`` whether that is a long tuple without arrays. Calls into EPypes are written out for values of the
+    types that the last run had, since each costs some microseconds after a function that has filled the caches with an
+    image; any other value takes the general way.
+
+    Parameters
+    ----------
+    program
+        What is run.
+    tokens
+        As they are before the run.
+    wanted
+        By step, 1 for those that may run; all of them for None.
+    plain
+        The slots of hyperparameters that hold no arrays.
+    changed
+        The source tokens that have got new values.
+    kinds
+        A guess of the types by slot; empty if there is none.
+    """
+
+    def __init__(
+        self, program: Program, tokens: TokenManager, wanted: bytes | None, plain: Collection[int],
+        changed: Collection[str], kinds: Sequence[type],
+    ) -> None:  # fmt: skip
+        self._program, self._plain, self._is_first = program, frozenset(plain), tokens.origin is None
+        self._array, self._kinds = array_type(), kinds
+        self._certain = bytes(tokens.dirty)
+        self._carried = tokens.origin or b""
+        self._changed = {program.slots[token] for token in changed}
+        self._marked = sorted({place for slot in self._changed for place in program.consumers[slot]})
+        stale = program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), ())
+        self._steps = [program.steps[place] for place in sorted(stale) if wanted is None or wanted[place]]
+        # Slots of which the source knows whether they are new, and those of which it knows whether their values, made
+        # in this run, are long tuples without arrays.
+        self._known: set[int] = set()
+        self._made: set[int] = set()
+
+    def compile(self) -> CompiledRun:
+        """Return the function that runs the steps."""
+        lines = [
+            f"def make(program, steps, {', '.join(_NAMES)}, array):",
+            *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
+            # As arguments they stand side by side in the frame: each variable of ``make`` is an object of its own.
+            f"    def run(t, v, D, d, {', '.join(f'{name}={name}' for name in _FREQUENT)}):",
+            *(f"        D[{place}] = 1" for place in self._marked),
+            "        start = 0",
+            "        try:",
+            *(f"            {line}" for line in self._lend_sources()),
+            *(f"            {line}" for step in self._steps for line in self._step(step)),
+            "            pass",
+            "        except BaseException:",
+            "            if start: d[t.running] = clock() - start",
+            "            raise",
+            "    return run",
+        ]
+        names: dict[str, Any] = {}
+        exec(compile("\n".join(lines), "<epypes: a compiled run>", "exec"), names)  # noqa: S102 - numbers only
+        run: CompiledRun = names["make"](self._program, self._program.steps, *_NAMES.values(), self._array)
+        return run
+
+    def _lend_sources(self) -> Iterator[str]:
+        """Lend the arrays of source tokens one after another, while the code that does it is in the caches."""
+        for step in self._steps:
+            slots = [slot for slot in step.inputs if self._is_lent_first(step, slot)]
+            if slots:
+                yield f"t.running = {step.place}"
+            for slot in dict.fromkeys(slots):
+                yield f"s{step.place}_{slot} = v[{slot}]"
+                yield from self._lend(step, f"s{step.place}_{slot}", slot)
+
+    def _is_lent_first(self, step: Step, slot: int) -> bool:
+        is_array = self._program.makers[slot] < 0 and slot not in self._plain and self._kind(slot) is self._array
+        return is_array and self._is_written_out(step) and self._program.guard and bool(self._certain[step.place])
+
+    def _is_written_out(self, step: Step) -> bool:
+        program = self._program
+        return step.is_plain or not (
+            program.guard or step.contracts or program.check_mutation or step.switch is not None
+        )
+
+    def _step(self, step: Step) -> Iterator[str]:
+        checked = [] if self._is_first else [slot for slot in step.outputs if self._program.consumers[slot]]
+        lines = [f"t.running = {step.place}", *self._call(step)]
+        for place, slot in enumerate(step.outputs):
+            if slot in checked:
+                lines += [
+                    f"c{slot} = not is_unchanged(v[{slot}], m{place}, ({self._given(step)}), program.guard)",
+                    f"if c{slot}:",
+                    f"    v[{slot}] = m{place}",
+                    f"    {' = '.join(f'D[{reader}]' for reader in self._program.consumers[slot])} = 1",
+                ]
+            else:
+                lines.append(f"v[{slot}] = m{place}")
+        if not self._is_first:
+            lines.append(f"D[{step.place}] = 0")
+        if not self._certain[step.place]:
+            yield from (f"c{slot} = False" for slot in checked)
+            yield from (f"h{slot} = False" for slot in step.outputs if slot in self._made)
+            yield f"if D[{step.place}]:"
+            lines = [f"    {line}" for line in lines]
+        yield from lines
+        self._known.update(checked)
+
+    def _given(self, step: Step) -> str:
+        """Write out the values that a step read and that are not new; none if it is not known what was new to it."""
+        if self._carried[step.place]:
+            return ""
+        old = [slot for slot in step.inputs if slot not in self._changed]
+        return "".join(f"None if c{slot} else v[{slot}], " if slot in self._known else f"v[{slot}], " for slot in old)
+
+    def _call(self, step: Step) -> Iterator[str]:
+        """Write out the call of a step, whose values are then ``m0``, ``m1`` and so on."""
+        program, made = self._program, [f"m{place}" for place in range(len(step.outputs))]
+        if not self._is_written_out(step):
+            yield "start = 0"
+            yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(program, steps[{step.place}], v, d)"
+            return
+        args = [f"v[{slot}]" for slot in step.inputs]
+        for place, slot in enumerate(step.inputs):
+            if self._is_lent_first(step, slot) and step.inputs.index(slot) == place:
+                args[place] = f"s{step.place}_{slot}"
+            elif program.guard and slot not in self._plain:
+                args[place] = name = f"a{place}"
+                yield f"start = 0; {name} = v[{slot}]"
+                yield from self._lend(step, name, slot)
+        yield "start = clock()"
+        function = f"f{step.place}" if step.node is None else f"f{step.place}.func"
+        yield f"{'m0' if step.single else 'made'} = {function}({', '.join(args)})"
+        yield f"d[{step.place}] = clock() - start"
+        if not step.single and step.outputs:
+            names = "".join(f"{name}, " for name in made)
+            yield f"if kind(made) is tuple and len(made) == {len(made)} and count(made) <= {FRESH_HERE}:"
+            yield f"    {names} = made"
+            yield "    made = None"  # so that it does not count as one that knows the items
+            if program.guard:
+                for name, slot in zip(made, step.outputs, strict=True):
+                    yield from (f"    {line}" for line in self._keep(name, slot))
+            unknown = "".join(f"h{slot} = " for slot in step.outputs if slot in self._made)
+            yield f"else: {unknown and unknown + 'False; '}{names} = unpack(program, steps[{step.place}], made, v)"
+        elif program.guard and step.outputs:
+            yield from self._keep("m0", step.outputs[0])
+
+    def _kind(self, slot: int) -> type:
+        return self._kinds[slot] if self._kinds else object
+
+    def _lend(self, step: Step, name: str, slot: int) -> Iterator[str]:
+        """Write out ``lend``: what `keep` has locked needs no lock, and a function that only reads no view."""
+        maker = self._program.makers[slot]
+        is_locked = maker >= 0 and self._program.steps[maker].switch is None
+        kind = self._kind(slot)
+        if (
+            kind is self._array
+            and is_locked
+            and only_reads_arrays(step.function if step.node is None else step.node.func)
+        ):
+            yield f"if kind({name}) is not array: {name} = lend({name})"
+        elif kind is self._array and is_locked:
+            yield f"{name} = {name}.view() if kind({name}) is array else lend({name})"
+        elif kind is self._array:
+            yield f"if kind({name}) is array:"
+            yield f"    {name} = {name}.view()"
+            yield f"    {name}.setflags(False)"
+            yield f"else: {name} = lend({name})"
+        elif kind is tuple and slot in self._made:
+            yield f"if not h{slot}: {name} = lend({name})"
+        elif kind is tuple:
+            yield f"if not ({_is_harmless(name, kind)}): {name} = lend({name})"
+        elif kind is list:
+            yield f"{name} = {name}.copy() if {_is_harmless(name, kind)} else lend({name})"
+        else:
+            yield f"if kind({name}) not in ARRAYLESS: {name} = lend({name})"
+
+    def _keep(self, name: str, slot: int) -> Iterator[str]:
+        """Write out ``keep``; an array that no function reads need not be locked."""
+        kind, general = self._kind(slot), f"{name} = keep({name}, FRESH, program, {slot}, v)"
+        if kind is self._array:
+            owner = f"kind(b) is array and b.base is None and count(b) <= {FRESH_OWNER}"
+            base = f"(b := {name}.base) is None or {owner}"
+            yield f"if kind({name}) is array and count({name}) <= {FRESH_HERE} and ({base}):"
+            yield f"    {name}.setflags(False)" if self._program.consumers[slot] else "    pass"
+            yield f"else: {general}"
+        elif kind is tuple:
+            yield f"h{slot} = {_is_harmless(name, kind)}"
+            yield f"if not h{slot}: {general}"
+            self._made.add(slot)
+        elif kind is list:
+            yield f"if not ({_is_harmless(name, kind)} and count({name}) <= {FRESH_HERE}): {general}"
+        else:
+            yield f"if kind({name}) not in ARRAYLESS: {general}"
+
+
+def _is_harmless(name: str, kind: type) -> str:
+    """Write out whether a value is a long tuple or list without arrays, as its first item tells."""
+    return f"kind({name}) is {kind.__name__} and len({name}) >= {LONG} and kind({name}[0]) in HARMLESS"
+
+
+def only_reads_arrays(function: object) -> bool:
+    """Whether a function can change nothing about a locked array: those of OpenCV, and universal functions.
+
+    Other C functions can: setattr changes an array's shape.
+    """
+    numpy, cv2 = sys.modules.get("numpy"), sys.modules.get("cv2")
+    if numpy is not None and type(function) is numpy.ufunc:
+        return True
+    if cv2 is None or type(function) is not BuiltinFunctionType or function.__self__ is not None:
+        return False
+    name = function.__name__
+    if vars(cv2).get(name) is function:
+        return True
+    parts = [module for path, module in list(sys.modules.items()) if path.startswith("cv2.")]
+    return any(getattr(module, name, None) is function for module in parts)
+
+
+# -- in threads -------------------------------------------------------------------------------------------------------
+
+
+class SideBySide:
+    """One run in threads, up to ``workers`` steps at once; one worker is the caller's thread.
+
+    If functions fail, the one that comes first in run order is the one that failed, as if they had run one after
+    another: steps that come before it are run, and those that come after it leave no trace.
+
+    The lock is held but for the calls of functions. Threads are made for one run, which takes 100 us each, and are
+    daemons: the interpreter exits while a function never returns.
+    """
+
+    def __init__(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int], workers: int) -> None:
+        program, values = tokens.program, tokens.values
+        self._tokens, self._durations_ns, self._workers = tokens, durations_ns, workers
+        self._before = values.copy(), tokens.dirty.copy()
+        self._made: dict[int, Sequence[Any]] = {}
+        self._failures: dict[int, BaseException] = {}
+        self._calls: set[int] = set()
+        self._is_over = False
+        self._changed = threading.Condition()
+        stale = program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), values)
+        steps = {place for place in stale if wanted is None or wanted[place]}
+        self._waits_for = {
+            place: steps.intersection(program.makers[slot] for slot in program.read_by(program.steps[place], values))
+            for place in steps
+        }
+        self._followers: dict[int, list[int]] = {place: [] for place in steps}
+        for place, makers in self._waits_for.items():
+            for maker in makers:
+                self._followers[maker].append(place)
+        self._ready = sorted(place for place in steps if not self._waits_for[place])
+
+    def run(self) -> None:
+        """Run all steps; raise what the first failed one in run order has raised."""
+        tokens = self._tokens
+        for _ in range(min(self._workers, len(self._waits_for)) - 1):
+            # numpy's errstate, for one, belongs to the context.
+            threading.Thread(target=copy_context().run, args=(self._work,), name="epypes worker", daemon=True).start()
+        try:
+            self._work()
+        except BaseException as exception:  # an interrupt while waiting; what the others still make is dropped
+            self._failures[min(self._calls, default=0)] = exception
+        with self._changed:
+            self._is_over = True
+            self._changed.notify_all()
+        if self._failures:
+            failed_at = min(self._failures)
+            tokens.values[:], tokens.dirty[:] = self._before
+            for place in sorted(self._made):
+                if place < failed_at:
+                    tokens.store(tokens.program.steps[place], self._made[place])
+                else:
+                    del self._durations_ns[place]
+            for place in self._failures:
+                if place != failed_at:
+                    del self._durations_ns[place]
+            tokens.running = failed_at
+            raise self._failures[failed_at]
+
+    def _work(self) -> None:
+        """Call what is ready, the first in run order first, until nothing is left."""
+        with self._changed:
+            while not self._is_over:
+                if self._ready and not (self._failures and self._ready[0] > min(self._failures)):
+                    self._call(heapq.heappop(self._ready))
+                elif self._calls:
+                    self._changed.wait()
+                else:
+                    break
+            self._changed.notify_all()
+
+    def _call(self, place: int) -> None:
+        tokens = self._tokens
+        program, mark = tokens.program, _Call(place)
+        step = program.steps[place]
+        failure: BaseException | None = None
+        made: Sequence[Any] = ()
+        self._calls.add(place)
+        program.running.add(mark)
+        self._changed.release()
+        try:
+            made = call(program, step, tokens.values, self._durations_ns)
+        except BaseException as exception:
+            failure = exception
+        finally:
+            self._changed.acquire()
+            program.running.discard(mark)
+        if self._is_over:
+            return
+        self._calls.discard(place)
+        if failure is None:
+            self._made[place] = made
+            tokens.store(step, made)
+            self._release(place)
+        else:
+            self._failures[place] = failure
+            # After Ctrl-C or an exit nobody waits for the others.
+            self._is_over = not isinstance(failure, Exception)
+        if len(self._ready) > 1 or not self._calls:
+            self._changed.notify_all()
+
+    def _release(self, done: int) -> None:
+        """Make ready what waited for a step alone; what is up to date after all is passed over."""
+        passed = [done]
+        while passed:
+            done = passed.pop()
+            for place in self._followers[done]:
+                self._waits_for[place].discard(done)
+                if self._waits_for[place]:
+                    continue
+                if self._tokens.dirty[place]:
+                    heapq.heappush(self._ready, place)
+                else:
+                    passed.append(place)
+
+
+class _Call:
+    """One call in a thread, for ``program.running``."""
+
+    def __init__(self, place: int) -> None:
+        self.running = place
+
+
+class Gain:
+    """What threads gain for one set of steps.
+
+    They pay where functions release the interpreter's lock and take longer than waking a thread. That can't be
+    predicted, so it is tried: the first runs go one after another and are timed, the next ones side by side if there
+    is something to be gained at best, and from then on the faster way is taken. Now and then the other is tried again.
+    """
+
+    def __init__(self, program: Program, workers: int) -> None:
+        self._program, self._workers = program, workers
+        self._one_by_one_ns: deque[int] = deque(maxlen=_TRIALS)
+        self._side_by_side_ns: deque[int] = deque(maxlen=_TRIALS)
+        self._is_promising = False
+        self._asked = 0
+
+    def is_worth_it(self) -> bool:
+        """Whether the next run should go side by side."""
+        if not self._is_promising or len(self._one_by_one_ns) < _TRIALS:
+            return False
+        if len(self._side_by_side_ns) < _TRIALS:
+            return True
+        self._asked += 1
+        is_faster = min(self._side_by_side_ns) < min(self._one_by_one_ns)
+        return is_faster != (self._asked % _TRY_AGAIN_AFTER == 0)
+
+    def learn(self, durations_ns: Mapping[int, int], total_ns: int, side_by_side: bool) -> None:
+        """Take note of a run that has ended without a failure: nanoseconds by step, and in all."""
+        if side_by_side:
+            self._side_by_side_ns.append(total_ns)
+            return
+        self._asked += 1
+        is_known = len(self._one_by_one_ns) >= _TRIALS
+        if is_known and not self._is_promising and self._asked % LOOK_AGAIN_AFTER:
+            return
+        self._one_by_one_ns.append(total_ns)
+        work_ns = sum(durations_ns.values())
+        best_ns = max(longest_path_ns(self._program, durations_ns), work_ns // self._workers)
+        self._is_promising = work_ns - best_ns > max(_MIN_GAIN_NS, _MIN_SHARE * total_ns)
+
+
+def has_independent_steps(program: Program) -> bool:
+    """Whether any two functions could run side by side."""
+    return longest_path_ns(program, {step.place: 1 for step in program.steps}) < len(program.steps)

@@ -1,0 +1,189 @@
+"""The result of a run: its tokens, its times, its failure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import NotComputed, StaleToken
+from epypes.graph import CompGraph, redefined
+from epypes.run.failure import Failure
+from epypes.run.guard import ARRAYLESS, lend
+from epypes.run.hyperparameters import Hyperparameters
+from epypes.run.program import Program
+from epypes.run.staleness import NOT_COMPUTED, TokenManager
+from epypes.run.timing import RunReport, Times
+from epypes.wording import counted
+
+if TYPE_CHECKING:
+    from weakref import ref
+
+
+# Values by slot, dirty flags by step, whether every source token has a value, the revisions of nested pipelines, the
+# hyperparameters with their versions, times, failure.
+Record = tuple[list[Any], bytes, bool, tuple[Any, ...], Hyperparameters, Times, Failure | None]
+
+# The state of a runner when a trial began: the runner's key, its hyperparameters, its last run. That one is not kept
+# alive, since a run's memory is that of its images.
+TrialOf = tuple[object, Hyperparameters, "ref[Run] | None"]
+
+
+class Run(Mapping[str, Any]):
+    """A run that has ended: a mapping from tokens to values, which does not change any more.
+
+    Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
+    draw on a copy, ``run["edges"].copy()``. A payload array is not copied: if its owner fills it again, the run and its
+    picture show what is in it then.
+    """
+
+    # While it runs, ``running`` is its step. Then one tuple is set, and nothing else: what is made of it is made when
+    # it is read, since to record a run takes a good part of what EPypes adds to its functions.
+    __slots__ = ("__weakref__", "_tokens", "record", "running", "trial_of")
+    running: int
+    trial_of: TrialOf
+
+    def __init__(self, record: Record) -> None:
+        self.record = record
+
+    @property
+    def report(self) -> RunReport:
+        """The times of the run."""
+        return RunReport(*self.record[5])
+
+    @property
+    def failure(self) -> Failure | None:
+        """None, or the function that failed; the tokens that were computed before keep their values."""
+        return self.record[6]
+
+    @property
+    def hyperparameters(self) -> Mapping[str, Any]:
+        """The values that the run was computed with."""
+        return self.record[4].values
+
+    @property
+    def first_hyperparameters(self) -> Mapping[str, Any]:
+        """The values that they had when they were made or frozen, by token."""
+        return self.record[4].first_values
+
+    @property
+    def revision(self) -> int:
+        """The runner's count of hyperparameter changes when the run began."""
+        return self.record[4].revision
+
+    @property
+    def cg(self) -> CompGraph:
+        """The graph that was run."""
+        return self.record[4].program.cg
+
+    @property
+    def tokens(self) -> TokenManager:
+        """The token store."""
+        try:
+            return self._tokens
+        except AttributeError:
+            values, dirty, has_payload, revisions, hparams, _, _ = self.record
+            self._tokens: TokenManager = TokenManager.of_run(
+                hparams.program, values, bytearray(dirty), has_payload, revisions
+            )
+            return self._tokens
+
+    def __getitem__(self, token: str) -> Any:
+        values, dirty, has_payload, _, hparams, _, _ = self.record
+        # Of a run that is whole every token has a value, and none is out of date.
+        slot = hparams.program.slots.get(token)
+        if slot is not None and has_payload and 1 not in dirty:
+            value = values[slot]
+            return value if type(value) in ARRAYLESS or not hparams.program.guard else lend(value)
+        try:
+            return self.tokens.read(token)
+        except StaleToken:
+            raise
+        except NotComputed as error:
+            if self.failure is None:
+                raise
+            text = f"Token {token!r} has not been computed, since {self.failure}."
+            raise NotComputed(token, text) from error
+
+    def __iter__(self) -> Iterator[str]:
+        tokens = self.tokens
+        return (token for token in self.cg.tokens if tokens.is_readable(token))
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    # Values may be arrays, so runs are told apart by identity.
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __repr__(self) -> str:
+        state = f"failed in {self.failure.function!r:.30}" if self.failure else "completed"
+        redefinitions = len(redefined(self.cg))
+        old = f"; {counted(redefinitions, 'function')} redefined" * bool(redefinitions)
+        return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
+
+
+class RunImporter:
+    """Makes Runs of one graph from the values, times and failure of runs that another process executed.
+
+    Parameters
+    ----------
+    cg
+        The graph; its functions are not called.
+    """
+
+    def __init__(self, cg: CompGraph) -> None:
+        self._program = Program(cg, True)
+
+    def run(
+        self,
+        tokens: Mapping[str, Any],
+        hyperparameters: Mapping[str, Any],
+        *,
+        first_hyperparameters: Mapping[str, Any] | None = None,
+        revision: int = 0,
+        durations_ns: Mapping[str, int] | None = None,
+        total_ns: int = 0,
+        failure: Failure | None = None,
+    ) -> Run:
+        """Return a run in which these tokens are computed and up to date, and all others are not computed.
+
+        Parameters
+        ----------
+        tokens
+            Values by token; what is no token of the graph is left out.
+        hyperparameters, first_hyperparameters
+            Their values in this run, and when they were frozen.
+        revision
+            Of the hyperparameters.
+        durations_ns
+            Nanoseconds by function.
+        total_ns
+            Of the whole run.
+        failure
+            Of the function that failed, if one did.
+        """
+        program, first = self._program, first_hyperparameters or {}
+        slots = [NOT_COMPUTED] * len(program.tokens)
+        for token, value in {**tokens, **hyperparameters}.items():
+            if token in program.slots:
+                slots[program.slots[token]] = value
+        entries = {token: (value, first.get(token, value)) for token, value in hyperparameters.items()}
+        # No function is out of date; but not every token has a value, so the run must not be taken for a whole one.
+        known = durations_ns or {}
+        by_step = {step.place: known[step.name] for step in program.steps if step.name in known}
+        failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
+        times = (program, None, by_step, total_ns, False, failed_at)
+        hparams = Hyperparameters(program, entries, revision)
+        return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
+
+
+# Half the time of Run(...).
+new_run: Final[Callable[[], Run]] = partial(object.__new__, Run)

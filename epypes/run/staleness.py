@@ -1,0 +1,258 @@
+"""Token values of a run and which of them are out of date.
+
+Staleness never looks at data: a step is dirty when something that it reads has got a new version since it last ran.
+The cost does not depend on the size of the values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+from epypes.errors import NotComputed, StaleToken
+from epypes.graph import CompGraph
+from epypes.run.guard import is_plain_array, is_same_guarded_array, lend
+from epypes.run.program import Program, Step
+
+_SCALARS: Final = frozenset({int, float, complex, bool, type(None)})
+_TEXTS: Final = frozenset({str, bytes})
+_SMALL_TUPLE: Final = 16
+# Longer texts (an encoded image) are taken for new unless they are the same object.
+_SHORT_TEXT: Final = 1_000
+
+
+class _NotComputed:
+    """The state of a token without value; None is a value."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return "NOT_COMPUTED"
+
+
+NOT_COMPUTED: Final = _NotComputed()
+
+
+class TokenManager:
+    """The values of a graph's tokens; they do not change any more when their run has ended.
+
+    A runner delegates storage to it: each run works on values of its own, so concurrent runs never see each other's,
+    and leaves them as ``run.tokens``.
+
+    Parameters
+    ----------
+    cg
+        The graph.
+    values
+        By token, the values that are known and up to date; none without.
+
+    Raises
+    ------
+    UnknownName
+        The graph has no such token.
+
+    Attributes
+    ----------
+    program
+        What is run.
+    values
+        By slot.
+    dirty
+        By step, 1 if it has to run before its outputs can be read: it never ran, failed, or one of its inputs has a
+        new value.
+    has_payload
+        Whether every source token has a value; if not, each run has to see whether it needs one that has none.
+    revisions
+        Those of nested pipelines, when the run began.
+    running
+        The step that is being run, -1 for none. Steps that run side by side are in ``program.running`` alone.
+    origin
+        The steps that were dirty before anything was changed, of which it is not known what was new to them; None in a
+        run from scratch.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Computational graphs".
+
+    Examples
+    --------
+    >>> cg = CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")})
+    >>> tokens = TokenManager(cg, {"x": 1})
+    >>> tokens["x"], "total" in tokens
+    (1, False)
+    """
+
+    __slots__ = ("_new", "_stale", "dirty", "has_payload", "origin", "program", "revisions", "running", "values")
+
+    def __init__(self, cg: CompGraph, values: Mapping[str, Any] | None = None) -> None:
+        program = Program(cg, True)
+        stored: list[Any] = [NOT_COMPUTED] * len(program.tokens)
+        for token, value in (values or {}).items():
+            cg.require_token(token)
+            stored[program.slots[token]] = value
+        # No function is out of date; but not every token has a value.
+        self._set(program, stored, bytearray(program.clean), False, program.revisions())
+
+    def _set(
+        self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
+    ) -> None:
+        self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
+        self.revisions = revisions
+        self.running = -1
+        self.origin: bytes | None = None
+        # Slots with new values.
+        self._new: set[int] = set()
+        self._stale: set[int] | None = None
+
+    @classmethod
+    def of_run(
+        cls, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
+    ) -> TokenManager:
+        """Return the tokens of a run, by slot."""
+        tokens = cls.__new__(cls)
+        tokens._set(program, values, dirty, has_payload, revisions)
+        return tokens
+
+    @classmethod
+    def from_scratch(cls, program: Program, values: list[Any], has_payload: bool) -> TokenManager:
+        """Return tokens of which only source tokens have values."""
+        return cls.of_run(program, values, bytearray(b"\1") * len(program.steps), has_payload, program.revisions())
+
+    # -- while functions run ------------------------------------------------------------------------------------
+
+    def branch(self) -> TokenManager:
+        """Return tokens with the same values, for a run that goes on from these."""
+        program = self.program
+        branch = TokenManager.of_run(
+            program, self.values.copy(), self.dirty.copy(), self.has_payload, program.revisions()
+        )
+        for place, before, now in zip(program.revised, self.revisions, branch.revisions, strict=True):
+            branch.dirty[place] |= before != now
+        branch.origin = bytes(branch.dirty)
+        return branch
+
+    def change(self, values: Mapping[str, Any]) -> tuple[str, ...]:
+        """Give source tokens values; return those whose value is another one."""
+        slots = self.program.slots
+        return tuple([token for token, value in values.items() if self._store(slots[token], value, ())])
+
+    def store(self, step: Step, made: Sequence[Any]) -> None:
+        """Store what a step has made, guarded if the program is; the steps that read something new become dirty."""
+        self.dirty[step.place] = 0
+        if self.origin is None:
+            for slot, value in zip(step.outputs, made, strict=True):
+                self.values[slot] = value
+            return
+        given: Sequence[Any] = ()
+        if not self.origin[step.place]:
+            given = [self.values[slot] for slot in step.inputs if slot not in self._new]
+        for slot, value in zip(step.outputs, made, strict=True):
+            self._store(slot, value, given)
+
+    def _store(self, slot: int, value: Any, given: Sequence[Any]) -> bool:
+        program = self.program
+        if is_unchanged(self.values[slot], value, given, program.guard):
+            return False
+        self.values[slot] = value
+        self._new.add(slot)
+        for place in program.consumers[slot]:
+            step = program.steps[place]
+            if step.switch is None or slot in program.read_by(step, self.values):
+                self.dirty[place] = 1
+        return True
+
+    def forget(self, steps: Iterable[int]) -> None:
+        """Make the outputs of these steps read as not computed."""
+        for place in steps:
+            self.dirty[place] = 1
+            for slot in self.program.steps[place].outputs:
+                self.values[slot] = NOT_COMPUTED
+
+    # -- reading ------------------------------------------------------------------------------------------------
+
+    @property
+    def stale(self) -> set[int]:
+        """The steps whose outputs are out of date: the dirty ones and what depends on them."""
+        if self._stale is None:
+            starts = [place for place, is_dirty in enumerate(self.dirty) if is_dirty] if 1 in self.dirty else ()
+            self._stale = self.program.downstream(starts, self.values)
+        return self._stale
+
+    def is_computed(self, token: str) -> bool:
+        """Whether the token has a value, be it stale."""
+        return self.values[self.program.slots[token]] is not NOT_COMPUTED
+
+    def is_stale(self, token: str) -> bool:
+        """Whether the token has a value that is out of date."""
+        if not self.stale:
+            return False
+        slot = self.program.slots[token]
+        return self.program.makers[slot] in self.stale and self.values[slot] is not NOT_COMPUTED
+
+    def is_readable(self, token: str) -> bool:
+        """Whether the token has a value that is up to date."""
+        return self.is_computed(token) and not self.is_stale(token)
+
+    def read(self, token: str) -> Any:
+        """Return a token's value, arrays as read-only views.
+
+        Raises
+        ------
+        UnknownName
+            There is no such token.
+        StaleToken
+            Its value is out of date.
+        NotComputed
+            It has none.
+        """
+        program = self.program
+        program.cg.require_token(token)
+        if self.is_stale(token):
+            raise StaleToken(token)
+        slot = program.slots[token]
+        value = self.values[slot]
+        if value is NOT_COMPUTED:
+            is_source = program.makers[slot] < 0
+            way_out = f"Call rerun({token!r}), or run() with the graph's payload."
+            way_out = f"Pass it: run({token}=...)." if is_source else way_out
+            raise NotComputed(token, f"Token {token!r} has not been computed. {way_out}")
+        return lend(value) if program.guard else value
+
+    def __getitem__(self, token: str) -> Any:
+        return self.read(token)
+
+    def __contains__(self, token: str) -> bool:
+        return self.program.cg.has_token(token) and self.is_readable(token)
+
+    def __iter__(self) -> Iterator[str]:
+        return (token for token in self.program.tokens if self.is_readable(token))
+
+
+def is_same_value(old: Any, new: Any) -> bool:
+    """Whether two immutable values are cheaply known to be equal: numbers, short texts and small tuples of them.
+
+    The types must agree, so that True is not 1 and 1 is not 1.0; NaN is not equal to itself, so it counts as new.
+    Arrays are never compared.
+    """
+    kind = type(old)
+    if kind is not type(new):
+        return False
+    if kind in _SCALARS:
+        # 0.0 == -0.0, but they do not always compute the same: the sign is in the repr.
+        return bool(old == new) and (kind not in (float, complex) or repr(old) == repr(new))
+    if kind in _TEXTS:
+        return old is new or (len(old) == len(new) <= _SHORT_TEXT and bool(old == new))
+    if kind is tuple:
+        return len(old) == len(new) <= _SMALL_TUPLE and all(map(is_same_value, old, new))
+    return False
+
+
+def is_unchanged(old: Any, new: Any, given: Sequence[Any], guard: bool) -> bool:
+    """Whether a function's new value is cheaply known to be what it was.
+
+    ``given`` are the values that the function read and that are not new. A guarded array that was passed through from
+    them is known to be unchanged; of other values small immutable ones are compared.
+    """
+    if is_same_value(old, new):
+        return True
+    return guard and is_plain_array(new) and is_plain_array(old) and is_same_guarded_array(old, new, given)
