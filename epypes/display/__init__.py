@@ -13,6 +13,9 @@ from epypes.display.show import Figure, show
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.scenes import scene_of
 from epypes.display.views.view import view
+from epypes.rich_display import Formatters, register
+
+register(Formatters(mimebundle, to_text))
 
 __all__ = [
     "Backdrop",

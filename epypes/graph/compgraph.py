@@ -28,6 +28,7 @@ from epypes.graph.switch import as_switch
 from epypes.graph.typecheck import check_types
 from epypes.images import Contracts
 from epypes.optional import optional_import
+from epypes.rich_display import mimebundle
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -304,8 +305,6 @@ class CompGraph:
         return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

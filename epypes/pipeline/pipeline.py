@@ -15,6 +15,7 @@ from epypes.hints import Param, Roi
 from epypes.pipeline.network import NodeBasedCompGraph
 from epypes.pipeline.node import Node, is_a_call
 from epypes.pipeline.stages import Stages
+from epypes.rich_display import mimebundle
 from epypes.run import CompGraphRunner, Run
 from epypes.wording import counted
 
@@ -183,8 +184,6 @@ class Pipeline(Node):
         return [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from epypes.graph import CompGraph
+from epypes.rich_display import mimebundle, to_text
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.need import chosen_branches, missing_sources, needed_placeholders, wanted_steps
 from epypes.run.tokens import NOT_COMPUTED, TokenManager
@@ -63,13 +64,9 @@ class Plan:
         return f"<Plan: {counted(count, 'function')} to run, {len(self.reused)} reused{missing}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
-
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph.redefined import redefined
+from epypes.rich_display import mimebundle
 from epypes.run.failure import Failure
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.hyperparameters import Hyperparameters
@@ -112,8 +113,6 @@ class Run(Mapping[str, Any]):
         return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, overload
 
 from epypes.optional import optional_import
+from epypes.rich_display import mimebundle, to_text
 from epypes.run.program import Program, longest_path_ns
 from epypes.wording import counted
 
@@ -158,13 +159,9 @@ class RunReport:
         return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{', 1 failed' * failed}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
-
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 
@@ -207,13 +204,9 @@ class Reports(Sequence[RunReport]):
         return f"<Reports of {counted(len(self), 'run')}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
-
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

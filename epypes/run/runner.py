@@ -9,6 +9,7 @@ from typing import Any
 
 from epypes.errors import StaleToken, require_mapping
 from epypes.graph import CompGraph
+from epypes.rich_display import mimebundle
 from epypes.run.attempt import AttemptsByKind, Outcome
 from epypes.run.call import StepFailed
 from epypes.run.draft import draft_after, tokens_now
@@ -412,6 +413,4 @@ class CompGraphRunner:
         return one_line(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from epypes.optional import optional_import
+from epypes.rich_display import mimebundle, to_text
 from epypes.run.report import RunReport
 from epypes.wording import counted
 
@@ -171,13 +172,9 @@ class TimingSummary:
         return f"<TimingSummary: {counted(self.runs, 'run')}, {counted(functions, 'function')}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
-
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 
