@@ -30,8 +30,7 @@ from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
 from epypes.bundle.fingerprint import combined_digest
-from epypes.display.durations import duration_text
-from epypes.display.markup import content, cut, cut_name, escape
+from epypes.display.text import content, cut, cut_name, duration_text, escape
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner

@@ -20,7 +20,7 @@ from epypes.display import mimebundle, to_svg, view
 from epypes.display.paint.page import paint_graph, paint_page
 from epypes.display.paint.svg import paint_svg
 from epypes.display.views.graphview import GraphView
-from epypes.display.views.source import LINE_CHARACTERS, SIGNATURE_CHARACTERS, SOURCE_LINES, signature_and_source
+from epypes.display.views.structure import LINE_CHARACTERS, SIGNATURE_CHARACTERS, SOURCE_LINES, signature_and_source
 from tests.pictures import assert_same_picture
 
 SVG = "{http://www.w3.org/2000/svg}"

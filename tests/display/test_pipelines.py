@@ -12,9 +12,9 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.place import lay_out
+from epypes.display.layout.placement import lay_out
 from epypes.display.paint.svg import alt_text, paint_svg
-from epypes.display.paint.text import paint_text
+from epypes.display.paint.tables import paint_text
 from epypes.pipeline.stages import queue_stage
 from tests.display.test_display import SVG, texts, vertices
 from tests.display.test_states import TIMEOUT_S, Gate

@@ -13,7 +13,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle
-from epypes.display.views.times import report_times
+from epypes.display.paint.times import report_times
 from epypes.run.program import Program
 from epypes.run.report import Reports
 from tests.display.test_display import SVG, texts

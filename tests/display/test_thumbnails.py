@@ -11,8 +11,8 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.place import lay_out
-from epypes.display.limits import THUMBNAIL_CHARACTERS
+from epypes.display.layout.placement import lay_out
+from epypes.display.text import THUMBNAIL_CHARACTERS
 from epypes.display.views.tokens import Room, with_run_values
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -1,4 +1,4 @@
-"""What does a layout consist of?"""
+"""What a layout is made from and consists of."""
 
 from __future__ import annotations
 

@@ -14,11 +14,20 @@ from functools import cache
 from importlib import resources
 from typing import Any, Final
 
-from epypes.display.limits import CHARACTERS, CHARACTERS_OF_A_VERTEX, THUMBNAIL_CHARACTERS
-from epypes.display.markup import QUOTE, content, cut, escape, fitted, size
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
+from epypes.display.text import (
+    CHARACTERS,
+    CHARACTERS_OF_A_VERTEX,
+    QUOTE,
+    THUMBNAIL_CHARACTERS,
+    content,
+    cut,
+    escape,
+    fitted,
+    size,
+)
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.groups import function_count
 from epypes.wording import counted

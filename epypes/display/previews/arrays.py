@@ -5,19 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.markup import cut
-from epypes.display.previews.charts import bar_chart, line_chart
+from epypes.display.previews.drawing import bar_chart, line_chart
+from epypes.display.previews.encoding import THUMBNAIL_PX, encode_small, is_pooled, label_text, pillow_image
 from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
-from epypes.display.previews.imagekinds import image_kind, is_image, one_channel, sampled
-from epypes.display.previews.kinds import is_of
-from epypes.display.previews.labels import label_text
-from epypes.display.previews.ranges import is_of_dtype
-from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, is_pooled, pillow_image
+from epypes.display.previews.images import (
+    few_of,
+    image_kind,
+    is_image,
+    is_of_dtype,
+    one_channel,
+    sampled,
+    some_of,
+    statistics_text,
+)
+from epypes.display.previews.introspection import is_of
+from epypes.display.previews.model import Backdrop, Look, Preview, Scene, Sketch
+from epypes.display.previews.objects import record_sketch
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
-from epypes.display.previews.shown import Backdrop, Look, Preview, Scene, Sketch
-from epypes.display.previews.statistics import few_of, some_of, statistics_text
-from epypes.display.previews.tables import record_sketch
+from epypes.display.text import cut
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -138,22 +144,6 @@ def _are_counts(array: Array) -> bool:
         return False
     some = some_of(array)
     return array.ndim == 2 or bool(((some >= 0) & (some % 1 == 0)).all())
-
-
-def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
-    """Look at counts and edges as ``np.histogram`` returns them."""
-    counts, edges = value
-    text = f"{len(counts)} bins"
-    said = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
-    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(counts))
-
-
-def is_histogram(value: Any) -> bool:
-    """Whether a value is what ``np.histogram`` returns."""
-    if len(value) != 2 or not all(is_of(part, "numpy", "ndarray") and part.ndim == 1 for part in value):
-        return False
-    counts, edges = value
-    return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
 
 
 def _plain(array: Array) -> Preview:

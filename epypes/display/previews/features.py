@@ -8,11 +8,9 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.markup import cut
-from epypes.display.previews.charts import drawn_in_chart
-from epypes.display.previews.kinds import dotted_name, is_of
-from epypes.display.previews.marks import (
+from epypes.display.previews.drawing import (
     drawer,
+    drawn_in_chart,
     lie_on,
     marks_lie_on,
     pair_drawer,
@@ -23,8 +21,10 @@ from epypes.display.previews.marks import (
     some_pairs,
     some_points,
 )
+from epypes.display.previews.introspection import dotted_name, is_of
+from epypes.display.previews.model import Backdrop, Look, Marks, Most, Preview, Scene, Sketch
 from epypes.display.previews.short import array_text
-from epypes.display.previews.shown import Backdrop, Look, Marks, Most, Preview, Scene, Sketch
+from epypes.display.text import cut
 
 if TYPE_CHECKING:
     import numpy as np

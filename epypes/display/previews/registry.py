@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar, overload
 from weakref import WeakKeyDictionary
 
-from epypes.display.previews.kinds import dotted_name, kind_name, parents
-from epypes.display.previews.shown import Look
+from epypes.display.previews.introspection import dotted_name, kind_name, parents
+from epypes.display.previews.model import Look
 from epypes.run.guard import lend
 
 _Function = TypeVar("_Function", bound=Callable[[Any], Any])

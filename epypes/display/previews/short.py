@@ -10,10 +10,9 @@ from collections.abc import Iterable, Iterator
 from types import BuiltinFunctionType, FunctionType, MappingProxyType
 from typing import Any, Final
 
-from epypes.display.markup import cut
-from epypes.display.previews.fields import fields_of
-from epypes.display.previews.kinds import (
+from epypes.display.previews.introspection import (
     declared,
+    fields_of,
     is_array,
     items_in,
     kind_name,
@@ -23,6 +22,7 @@ from epypes.display.previews.kinds import (
     qualified_name,
     sorted_items,
 )
+from epypes.display.text import cut
 
 _MOST_BITS: Final = 400
 _LONGEST: Final = 200

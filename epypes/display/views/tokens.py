@@ -7,13 +7,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from epypes.display.limits import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
+from epypes.display.previews.encoding import THUMBNAIL_BYTES
+from epypes.display.previews.images import kept_range
+from epypes.display.previews.model import Look, Sketch
 from epypes.display.previews.preview import Preview, finished, sketch
-from epypes.display.previews.ranges import kept_range
-from epypes.display.previews.raster import THUMBNAIL_BYTES
-from epypes.display.previews.shown import Look, Sketch
-from epypes.display.views.backdrops import RunSurroundings
+from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.views.graphview import TokenState, TokenView
+from epypes.display.views.surroundings import RunSurroundings
 from epypes.run import Run
 
 # What a picture of so few bytes shows is hardly seen; rather are some left out.

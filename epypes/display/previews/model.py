@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
-from epypes.display.previews.ranges import Range, display_range
-from epypes.display.previews.raster import Picture
+from epypes.display.previews.encoding import Picture
+from epypes.display.previews.images import Range, display_range
 from epypes.images import Order
 
 if TYPE_CHECKING:

@@ -6,10 +6,13 @@ what is known of a value is only what its classes are, by identity.
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
-from types import GetSetDescriptorType, MappingProxyType, MemberDescriptorType
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from types import FunctionType, GetSetDescriptorType, MappingProxyType, MemberDescriptorType, SimpleNamespace
 from typing import Any, Final
 
 _name_of: Final = type.__dict__["__name__"].__get__
@@ -144,3 +147,60 @@ def sorted_items(value: Any, written: Callable[[Any], str], most: int = 2_000) -
         return kind_name(type(item)), is_plain, item if is_plain else written(item)
 
     return sorted(items_in(value), key=rank)
+
+
+_ATTRIBUTES: Final[Any] = declared(SimpleNamespace, "__dict__")
+
+
+def fields_of(value: Any) -> dict[str, Any] | None:
+    """Return the fields of a named tuple, or of a dataclass that Python writes by its fields; None of any other.
+
+    Fields that are not to be in the repr are left out, and those that a property computes.
+    """
+    kind = type(value)
+    if issubclass(kind, tuple):
+        names = declared(kind, "_fields")
+        return dict(zip(names, items_in(value), strict=False)) if type(names) is tuple else None
+    if declared(kind, "__repr__") is SimpleNamespace.__repr__:
+        return dict(_ATTRIBUTES.__get__(value))
+    if not _is_written_by_fields(kind):
+        return None
+    fields = ((field.name, stored(value, field.name)) for field in dataclasses.fields(kind) if field.repr)
+    return {name: found[0] for name, found in fields if found}
+
+
+def _is_written_by_fields(kind: type) -> bool:
+    """Whether a class has the repr that ``dataclass`` makes: one of its author's own may be to hide something."""
+    if type(declared(kind, "__dataclass_fields__")) is not dict:
+        return False
+    # The function that dataclass makes is told from others as pprint does.
+    made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
+    return type(made) is FunctionType and "__create_fn__" in made.__qualname__
+
+
+_is_looking: Final = ContextVar("_is_looking", default=False)
+
+
+def silent_numpy() -> AbstractContextManager[Any]:
+    """Return what keeps numpy from warning of numbers that overflow or are none: they are counted, and shown."""
+    numpy = sys.modules.get("numpy")
+    return nullcontext() if numpy is None else numpy.errstate(all="ignore")
+
+
+@contextmanager
+def looking() -> Iterator[bool]:
+    """Look at a value: numpy keeps silent about numbers that overflow.
+
+    Yields
+    ------
+    bool
+        Whether another value is being looked at meanwhile, since a function or repr of a user's shows a picture. One
+        that shows the run that its own value is in would never come to an end.
+    """
+    is_nested = _is_looking.get()
+    token = _is_looking.set(True)
+    try:
+        with silent_numpy():
+            yield is_nested
+    finally:
+        _is_looking.reset(token)

@@ -1,32 +1,108 @@
-"""How does an array become the bytes of a JPEG or PNG?
+"""How does an image of region numbers look?
 
-Pillow encodes: it comes with every notebook that has matplotlib, and unlike OpenCV's it has one wheel, so no OpenCV
-build is forced on anybody. Three channels are BGR, as in OpenCV, unless the caller
-says rgb.
+The colour of a label depends on nothing but its number, so that a region keeps its colour when others come and go.
 """
 
 from __future__ import annotations
 
+import colorsys
+import functools
 import io
+import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.bitmap import bitmap_png
-from epypes.display.previews.imagekinds import image_kind, is_image, is_mask, one_channel, sampled
-from epypes.display.previews.labels import label_picture
-from epypes.display.previews.looking import silent_numpy
-from epypes.display.previews.ranges import Range, display_range
+from epypes.display.previews.images import Range, display_range, image_kind, is_image, is_mask, one_channel, sampled
+from epypes.display.previews.introspection import silent_numpy
 from epypes.optional import optional_import
+from epypes.wording import counted
 
 if TYPE_CHECKING:
-    import numpy as np
     import numpy.typing as npt
     from PIL import Image
 
+    Array = npt.NDArray[Any]
+    import numpy as np
+
     from epypes.images import Order
 
-    Array = npt.NDArray[Any]
+# Byte 0 is black, for label 0; byte 255 is white, for what is negative, as the borders of cv2.watershed.
+_LABEL_COLOURS: Final = 254
+_WHITE: Final = 255
+_GOLDEN: Final = 0.618033988749895
+# Neighbouring numbers get hues far apart, and four numbers in a row differ in brightness, too.
+_TONES: Final = ((0.60, 0.95), (0.85, 0.75), (0.45, 1.00), (0.75, 0.88))
+
+
+@functools.cache
+def palette() -> bytes:
+    """Return 256 colours of three bytes."""
+    colours = bytearray(3)
+    for index in range(_LABEL_COLOURS):
+        saturation, brightness = _TONES[index % len(_TONES)]
+        colour = colorsys.hsv_to_rgb((0.58 + index * _GOLDEN) % 1.0, saturation, brightness)
+        colours += bytes(round(255 * channel) for channel in colour)
+    return bytes(colours) + b"\xff\xff\xff"
+
+
+def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
+    """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
+    import numpy as np
+
+    with optional_import():
+        from PIL import Image
+
+    stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
+    kept = labels[::stride, ::stride]
+    numbers = np.where(kept > 0, (kept.astype(np.int64) - 1) % _LABEL_COLOURS + 1, np.where(kept < 0, _WHITE, 0))
+    picture = Image.fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
+    picture.putpalette(palette())
+    return picture
+
+
+def label_text(sample: Array) -> str:
+    """Return how many labels there are besides 0."""
+    import numpy as np
+
+    positive = sample[sample > 0]
+    is_narrow = positive.size > 0 and int(positive.max()) <= 10 * sample.size
+    count = int(np.count_nonzero(np.bincount(positive))) if is_narrow else len(np.unique(positive))
+    return counted(count, "label")
+
+
+_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_DEPTH: Final = 1
+_GRAYSCALE: Final = 0
+# Masks are runs: longer matches than those of one byte are rarely found, and looking for them takes most of the time.
+_LEVEL: Final = 1
+_MEMORY: Final = 9
+
+
+def bitmap_png(mask: Array) -> bytes:
+    """Return a mask as a grayscale PNG whose pixels are black and white.
+
+    Parameters
+    ----------
+    mask
+        (height, width), bool or bytes; what is not 0 is white.
+    """
+    import numpy as np
+
+    height, width = mask.shape
+    packed = np.packbits(mask, axis=1)
+    rows = np.zeros((height, packed.shape[1] + 1), np.uint8)
+    rows[:, 1:] = packed  # each row begins with its filter, which is none
+    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, zlib.MAX_WBITS, _MEMORY, zlib.Z_RLE)
+    data = packer.compress(rows.tobytes()) + packer.flush()
+    header = struct.pack(">IIBBBBB", width, height, _DEPTH, _GRAYSCALE, 0, 0, 0)
+    return _SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
 
 __all__ = ["THUMBNAIL_BYTES", "THUMBNAIL_PX", "Picture", "encode_image", "encode_small", "is_image", "pillow_image"]
 

@@ -1,4 +1,4 @@
-"""How does any text become text of a page?"""
+"""Text of a picture: escaped, cut to what it may take, and measured in the bytes of a page."""
 
 from __future__ import annotations
 
@@ -6,6 +6,14 @@ import html
 import re
 import textwrap
 from typing import Final
+
+CHARACTERS: Final = 20_000
+CHARACTERS_OF_A_VERTEX: Final = 600
+# All thumbnails of a picture. Base64 makes four characters of three bytes.
+THUMBNAIL_CHARACTERS: Final = 80_000
+# More are no overview.
+MOST_THUMBNAILS: Final = 24
+
 
 # detect_and_describe_features_1, of the paper's figure 13, is to fit.
 _NAME_CHARACTERS: Final = 32
@@ -91,3 +99,22 @@ def short_name(name: str) -> str:
         characters = characters * 3 // 4
         short = cut_name(name, characters)
     return short
+
+
+def overhead_text(side_by_side: bool) -> str:
+    """Return what graph overhead is called; where functions ran side by side it is another quantity."""
+    return "graph overhead (wall time less critical path)" if side_by_side else "graph overhead"
+
+
+def duration_text(duration_ns: int) -> str:
+    """Return a duration with its unit, to three digits.
+
+    Examples
+    --------
+    >>> duration_text(5_230_000), duration_text(740)
+    ('5.23 ms', '740 ns')
+    """
+    for limit, unit in ((1e9, "s"), (1e6, "ms"), (1e3, "µs")):
+        if abs(duration_ns) >= limit:
+            return f"{duration_ns / limit:.3g} {unit}"
+    return f"{duration_ns} ns"

@@ -1,0 +1,342 @@
+"""Is an array an image, and is it to be seen as a mask, as labels or as a photograph?
+
+What is decided from the values of a large image is decided from a strided sample.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+from weakref import WeakKeyDictionary
+
+from epypes.display.previews.introspection import is_of, kind_name
+from epypes.run import CompGraphRunner, Run
+from epypes.run.program import Program
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    Array = npt.NDArray[Any]
+
+ImageKind = Literal["mask", "labels", "photograph"]
+
+SMALLEST_SIDE_PX: Final = 8
+# Beyond this many pixels some are looked at, and so many of them: to pick them takes longer than to look at them.
+EXACT_PX: Final = 1_000_000
+SAMPLE_PX: Final = 250_000
+# Of pixels and their neighbours fewer will do.
+_PAIRS_PX: Final = 60_000
+# Integers that are wide enough may be labels whatever they are; those of cameras only if they are small.
+_MOST_LABELS: Final = {1: 63, 2: 1023}
+_FEW_LABELS: Final = 7
+_MOST_DISTINCT: Final = 4096
+_EQUAL_NEIGHBOURS: Final = 0.8
+_EQUAL_OF_FEW: Final = 0.6
+# Most pixels of objects a few pixels wide lie at their edge; in sparse counts hardly a pixel has an equal neighbour.
+_EQUAL_OF_SMALL: Final = 0.2
+# Integers so wide are hardly a camera's.
+_WIDE_BYTES: Final = 4
+_SMALL_STEPS: Final = 0.8
+
+
+def is_image(value: Any) -> bool:
+    """Whether a value can be seen as an image: an array (y, x), (y, x, 3) or (y, x, 4), at least 8 x 8 pixels."""
+    if not is_of(value, "numpy", "ndarray") or value.dtype.kind not in "buif":
+        return False
+    shape = value.shape
+    channels = shape[2] if len(shape) == 3 else 1
+    return len(shape) in (2, 3) and channels in (1, 3, 4) and min(shape[:2]) >= SMALLEST_SIDE_PX
+
+
+def one_channel(image: Array) -> Array:
+    """Return an image (y, x, 1) as (y, x); any other as it is."""
+    return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
+def stride_of(image: Array) -> int:
+    """Return the n whose every n-th row and column make a sample; 1 if the image is small enough."""
+    pixels = image.shape[0] * image.shape[1]
+    return math.ceil(math.sqrt(pixels / SAMPLE_PX)) if pixels > EXACT_PX else 1
+
+
+def sampled(image: Array) -> Array:
+    """Return an image of at most a million pixels as it is, of a larger one every n-th row and column."""
+    stride = stride_of(image)
+    return image if stride == 1 else image[::stride, ::stride].copy()
+
+
+def image_kind(image: Array, sample: Array) -> ImageKind:
+    """Return what an image is to be seen as; ``sample`` are the pixels of it that are looked at."""
+    image, sample = one_channel(image), one_channel(sample)
+    if is_mask(sample):
+        return "mask"
+    return "labels" if _is_labels(image, sample) else "photograph"
+
+
+def is_mask(image: Array) -> bool:
+    """Whether an image of one channel has two values only: bool, or uint8 of 0 and 255, or of 0 and 1."""
+    if image.ndim != 2 or image.dtype.kind not in "bu" or image.dtype.itemsize > 1:
+        return False
+    # A few pixels of a photograph tell already that it is none.
+    return image.dtype.kind == "b" or (_has_two_values(image[::16, ::16]) and _has_two_values(image))
+
+
+def _has_two_values(image: Array) -> bool:
+    import numpy as np
+
+    # 0 and 255 are the two values that adding one, within a byte, brings to at most 1.
+    is_white: bool = bool(((image.astype(np.uint8, copy=False) + np.uint8(1)) <= 1).all())
+    return is_white or int(image.max(initial=0)) <= 1
+
+
+def _is_labels(image: Array, sample: Array) -> bool:
+    """Whether an image of whole numbers is constant by pieces, as those of regions are."""
+    if image.ndim != 2 or image.dtype.kind not in "iu" or not sample.size:
+        return False
+    least, largest = int(sample.min()), int(sample.max())
+    is_wide = image.dtype.itemsize >= _WIDE_BYTES
+    if least < -1 or not (0 if is_wide else 1) <= largest <= _MOST_LABELS.get(image.dtype.itemsize, largest):
+        return False
+    if least == largest:
+        # One object that fills the image, or none; larger numbers are rather measured.
+        return is_wide and largest <= 1
+    return _has_pieces(image, largest) and _has_few_values(sample, largest)
+
+
+def _has_few_values(sample: Array, largest: int) -> bool:
+    import numpy as np
+
+    return largest <= _MOST_DISTINCT or len(np.unique(sample)) <= _MOST_DISTINCT
+
+
+@dataclass(frozen=True, slots=True)
+class _Neighbours:
+    """How many pairs of pixels there are: touching an object, within objects, equal within them, differing, by one."""
+
+    touching: int
+    within: int
+    equal: int
+    by_one: int
+
+    @property
+    def differing(self) -> int:
+        return self.touching - self.equal
+
+
+def _has_pieces(image: Array, largest: int) -> bool:
+    """Whether most neighbours are equal, of those that are not background."""
+    pairs = _neighbours(image)
+    least_equal = _EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS
+    if image.dtype.itemsize >= _WIDE_BYTES:
+        return pairs.equal > 0 and (
+            pairs.equal >= least_equal * pairs.within and pairs.equal >= _EQUAL_OF_SMALL * pairs.touching
+        )
+    # In a dark and blurred photograph most are equal, too, but there they differ by one where they differ.
+    is_smooth = largest > _FEW_LABELS and pairs.by_one > _SMALL_STEPS * pairs.differing
+    return pairs.differing > 0 and not is_smooth and pairs.equal >= least_equal * pairs.touching
+
+
+def _neighbours(image: Array) -> _Neighbours:
+    import numpy as np
+
+    stride = math.ceil(math.sqrt(image.size / _PAIRS_PX))
+    at, right, below = image[:-1:stride, :-1:stride], image[:-1:stride, 1::stride], image[1::stride, :-1:stride]
+    touching = within = equal = by_one = 0
+    for side in (right, below):
+        ours, theirs = at, side[: at.shape[0], : at.shape[1]]
+        is_touching = (ours != 0) | (theirs != 0)
+        touching += int(np.count_nonzero(is_touching))
+        within += int(np.count_nonzero((ours != 0) & (theirs != 0)))
+        equal += int(np.count_nonzero(is_touching & (ours == theirs)))
+        by_one += int(np.count_nonzero(np.maximum(ours, theirs) - np.minimum(ours, theirs) == 1))
+    return _Neighbours(touching, within, equal, by_one)
+
+
+Range = tuple[float, float]
+
+# Cameras of 10, 12 and 14 bits write into 16.
+_BITS: Final = (8, 10, 12, 14, 16)
+_BYTE: Final = (0.0, 255.0)
+_UNIT: Final = (0.0, 1.0)
+_kept: WeakKeyDictionary[Program, dict[tuple[str, str], Range]] = WeakKeyDictionary()
+_lock = threading.Lock()
+
+
+def display_range(image: Array) -> Range:
+    """Return the values that are shown black and white, from the image alone."""
+    found = _own_range(image)
+    low, high = found if found is not None else _UNIT
+    return (low, high) if high > low else (low, low + 1.0)
+
+
+def sole_value(image: Array) -> Any:
+    """Return the value of an image that has but one and whose dtype does not tell how bright that is; None if not so.
+
+    Its own range would make it black, whatever it is.
+    """
+    if image.dtype.kind == "b" or (image.dtype.itemsize <= 2 and image.dtype.kind == "u"):
+        return None
+    first = image.flat[0]
+    # A few pixels of most images tell already that there are more values.
+    if not all(((part == first) | ((part != part) & (first != first))).all() for part in (image[::16, ::16], image)):
+        return None
+    return None if image.dtype.kind == "f" and 0.0 <= first <= 1.0 else first.item()
+
+
+def kept_range(program: Program, token: str, image: Array) -> Range:
+    """Return the values that are shown black and white in a token's images: what its first one had.
+
+    Of an image of one value nothing is kept, since it does not tell what is to come.
+    """
+    if image.dtype.kind == "b" or image.dtype.str[1:] == "u1":
+        return display_range(image)
+    key = token, image.dtype.str
+    with _lock:
+        ranges = _kept.setdefault(program, {})
+        if key in ranges:
+            return ranges[key]
+    found = _own_range(image)
+    if found is None or found[0] >= found[1]:
+        return display_range(image)
+    with _lock:
+        return ranges.setdefault(key, found)
+
+
+def reset_display_ranges(shown: Any) -> None:
+    """Forget which values are shown black and white; those of the next images are kept instead.
+
+    Parameters
+    ----------
+    shown
+        A runner, a run or a pipeline; of all its tokens.
+    """
+    runner = getattr(shown, "runner", shown)
+    run = runner.last if isinstance(runner, CompGraphRunner) else runner
+    if not isinstance(run, Run):
+        if isinstance(runner, CompGraphRunner):
+            return
+        raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
+    with _lock:
+        _kept.pop(run.tokens.program, None)
+
+
+def is_of_dtype(dtype: Any, ends: Range) -> bool:
+    """Whether a range is what everybody expects of a dtype: nothing has to be said of it then."""
+    expected = {"b": _UNIT, "f": _UNIT, "u": (0.0, 2.0 ** (8 * dtype.itemsize) - 1)}.get(dtype.kind)
+    return ends == expected
+
+
+def _own_range(image: Array) -> Range | None:
+    """Return the range of an image; None if it has no finite value or, of 16 bits, none but 0."""
+    import numpy as np
+
+    if image.dtype.kind == "b" or not image.size:
+        return _UNIT
+    if image.dtype.str[1:] == "u1":
+        return _BYTE
+    sample = sampled(image)
+    if image.dtype.str[1:] == "u2":
+        return _range_of_bits(int(sample.max()))
+    finite = sample[np.isfinite(sample)] if image.dtype.kind == "f" else sample
+    return _range_of(float(finite.min()), float(finite.max()), image.dtype.kind == "f") if finite.size else None
+
+
+def _range_of_bits(largest: int) -> Range | None:
+    bits = next(bits for bits in _BITS if largest < 2**bits)
+    return (0.0, 2.0**bits - 1) if largest else None
+
+
+def _range_of(low: float, high: float, is_float: bool) -> Range:
+    if is_float and low >= 0.0 and high <= 1.0:
+        return _UNIT
+    if low >= 0.0:
+        return low, high
+    reach = max(-low, high)
+    return -reach, reach
+
+
+_FEW: Final = 4_000
+
+
+def some_of(array: Array) -> Array:
+    """Return an array of at most a million values as it is, of a larger one every n-th."""
+    return array if array.size <= EXACT_PX else _sample(array, SAMPLE_PX)
+
+
+def few_of(array: Array) -> Array:
+    """Return a small array as it is, of a larger one a few thousand values: that takes no time worth counting."""
+    return array if array.size <= _FEW else _sample(array, _FEW)
+
+
+def _sample(array: Array, most: int) -> Array:
+    """Return about so many values, every n-th of each long axis: to flatten an array may take a copy of all of it."""
+    longest = _longest_axis(array.shape, most)
+    # A copy, since what lies far apart in memory is to be fetched once.
+    return array[tuple(slice(None, None, -(-length // longest)) for length in array.shape)].copy()
+
+
+def _longest_axis(shape: tuple[int, ...], most: int) -> int:
+    """Return the length that axes may have, so that no more than so many values are left and short axes stay whole."""
+    room = float(most)
+    for axes, length in zip(range(len(shape), 0, -1), sorted(shape), strict=True):
+        side = room ** (1 / axes)
+        if length > side:
+            return max(1, int(side + 1e-9))
+        room /= length
+    return max(shape)
+
+
+def statistics_text(sample: Array, array: Array) -> str:
+    """Return the range and mean of a sample, what of it is not finite, and how large the array is."""
+    return ", ".join(filter(None, (*_numbers(sample, array), memory_text(array.nbytes))))
+
+
+def _numbers(sample: Array, array: Array) -> list[str]:
+    import numpy as np
+
+    if not array.size:
+        return ["empty"]
+    if array.dtype.kind in "mM":
+        return [f"{sample.min()} to {sample.max()}"]
+    if array.dtype.kind == "b":
+        return [f"{np.mean(sample):.3g} of it true" + " in a sample" * (sample.size < array.size)]
+    if array.dtype.kind not in "iufc":
+        return []
+    values = np.abs(sample) if array.dtype.kind == "c" else sample
+    finite, odd = _finite(values)
+    if not finite.size:
+        return ["no finite value", *odd]
+    marked = " of a sample" if sample.size < array.size else ""
+    name = "magnitude " if array.dtype.kind == "c" else ""
+    # Without the wrappers of the methods, which take longer than to look at so few values.
+    least, most = np.minimum.reduce(finite, axis=None), np.maximum.reduce(finite, axis=None)
+    mean = np.add.reduce(finite, axis=None, dtype=np.float64) / finite.size
+    return [f"{name}{_text(least)} to {_text(most)}{marked}", f"mean {mean:.4g}", *odd]
+
+
+def _finite(values: Any) -> tuple[Any, list[str]]:
+    """Return the finite values, and how many of the others there are."""
+    import numpy as np
+
+    if values.dtype.kind != "f":
+        return values, []
+    is_finite = np.isfinite(values)
+    if is_finite.all():
+        return values, []
+    nan = int(np.count_nonzero(np.isnan(values)))
+    infinite = values.size - int(np.count_nonzero(is_finite)) - nan
+    return values[is_finite], [f"{count} {name}" for count, name in ((nan, "NaN"), (infinite, "inf")) if count]
+
+
+def _text(value: Any) -> str:
+    return f"{value:.6g}" if value.dtype.kind == "f" else str(value)
+
+
+def memory_text(size: int) -> str:
+    """Return a number of bytes with its unit, to three digits."""
+    for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if size >= limit:
+            return f"{size / limit:.3g} {unit}"
+    return f"{size} B"
