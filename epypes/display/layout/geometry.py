@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Direction = Literal["down", "right"]
 Shape = Literal["box", "ellipse", "hexagon"]
@@ -11,8 +10,7 @@ Point = tuple[float, float]
 Edge = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class Box(NamedTuple):
     """A vertex to be placed: its shape and size, in pixels."""
 
     shape: Shape
@@ -20,8 +18,7 @@ class Box:
     height: float
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
+class Layout(NamedTuple):
     """A laid-out graph; all lengths in pixels, y downwards.
 
     Attributes

@@ -6,14 +6,10 @@ What is decided from the values of a large image is decided from a strided sampl
 from __future__ import annotations
 
 import math
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
-from weakref import WeakKeyDictionary
 
-from epypes.display.previews.introspection import is_of, kind_name
-from epypes.run import CompGraphRunner, Run
-from epypes.run.program import Program
+from epypes.display.previews.introspection import is_of
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -160,13 +156,11 @@ Range = tuple[float, float]
 _BITS: Final = (8, 10, 12, 14, 16)
 _BYTE: Final = (0.0, 255.0)
 _UNIT: Final = (0.0, 1.0)
-_kept: WeakKeyDictionary[Program, dict[tuple[str, str], Range]] = WeakKeyDictionary()
-_lock = threading.Lock()
 
 
 def display_range(image: Array) -> Range:
     """Return the values that are shown black and white, from the image alone."""
-    found = _own_range(image)
+    found = own_range(image)
     low, high = found if found is not None else _UNIT
     return (low, high) if high > low else (low, low + 1.0)
 
@@ -185,50 +179,13 @@ def sole_value(image: Array) -> Any:
     return None if image.dtype.kind == "f" and 0.0 <= first <= 1.0 else first.item()
 
 
-def kept_range(program: Program, token: str, image: Array) -> Range:
-    """Return the values that are shown black and white in a token's images: what its first one had.
-
-    Of an image of one value nothing is kept, since it does not tell what is to come.
-    """
-    if image.dtype.kind == "b" or image.dtype.str[1:] == "u1":
-        return display_range(image)
-    key = token, image.dtype.str
-    with _lock:
-        ranges = _kept.setdefault(program, {})
-        if key in ranges:
-            return ranges[key]
-    found = _own_range(image)
-    if found is None or found[0] >= found[1]:
-        return display_range(image)
-    with _lock:
-        return ranges.setdefault(key, found)
-
-
-def reset_display_ranges(shown: Any) -> None:
-    """Forget which values are shown black and white; those of the next images are kept instead.
-
-    Parameters
-    ----------
-    shown
-        A runner, a run or a pipeline; of all its tokens.
-    """
-    runner = getattr(shown, "runner", shown)
-    run = runner.last if isinstance(runner, CompGraphRunner) else runner
-    if not isinstance(run, Run):
-        if isinstance(runner, CompGraphRunner):
-            return
-        raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
-    with _lock:
-        _kept.pop(run.tokens.program, None)
-
-
 def is_of_dtype(dtype: Any, ends: Range) -> bool:
     """Whether a range is what everybody expects of a dtype: nothing has to be said of it then."""
     expected = {"b": _UNIT, "f": _UNIT, "u": (0.0, 2.0 ** (8 * dtype.itemsize) - 1)}.get(dtype.kind)
     return ends == expected
 
 
-def _own_range(image: Array) -> Range | None:
+def own_range(image: Array) -> Range | None:
     """Return the range of an image; None if it has no finite value or, of 16 bits, none but 0."""
     import numpy as np
 

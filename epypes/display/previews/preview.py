@@ -1,4 +1,4 @@
-"""Is what a user's preview function returned fit to be painted?"""
+"""The preview of one value: a line of text, and a thumbnail if it can be drawn."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from epypes.display.previews import arrays, objects
 from epypes.display.previews.drawing import MOST_LINES, MOST_POINTS
@@ -21,65 +21,13 @@ from epypes.display.text import cut
 from epypes.images import Order
 from epypes.optional import optional_import
 
-if TYPE_CHECKING:
-    from PIL import Image
-
-_FORMATS: Final = {"image/png": "PNG", "image/jpeg": "JPEG"}
-_CHARTS: Final = ("line", "bars", "points")
-# To decode more takes longer than a thumbnail may.
-_MOST_PIXELS: Final = 25_000_000
-
-
-def checked_chart(chart: Any) -> Chart:
-    """Return a chart within the limits: of finite points, each between 0 and 1."""
-    if type(chart) is not Chart or chart.kind not in _CHARTS:
-        raise TypeError(f"chart of a preview must be a Chart of kind {', '.join(_CHARTS)}")
-    room, series = MOST_POINTS, []
-    for points in itertools.islice(chart.series, MOST_POINTS):
-        pairs = [(float(x), float(y)) for x, y in itertools.islice(points, room)]
-        room -= len(pairs)
-        kept = tuple((min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)) for x, y in pairs if math.isfinite(x + y))
-        series += [kept] * bool(kept)
-    return Chart(chart.kind, tuple(series[:MOST_LINES]))
-
-
-def checked_picture(picture: Any, most_bytes: int) -> Picture:
-    """Return a picture within the limits of a thumbnail, that is what it says to be."""
-    data, media_type, width, height = picture.data, picture.media_type, picture.width, picture.height
-    if type(media_type) is not str or media_type not in _FORMATS:
-        raise ValueError(f"media_type of a picture must be {' or '.join(_FORMATS)}")
-    if type(data) is not bytes:
-        raise TypeError(f"data of a picture must be bytes, not {kind_name(type(data))}")
-    if not all(type(side) is int and side > 0 for side in (width, height)):
-        raise ValueError("width and height of a picture must be whole and positive")
-    opened = _opened(data, _FORMATS[media_type])
-    if max(opened.size) <= THUMBNAIL_PX and len(data) <= most_bytes:
-        # What is broken is found by decoding it, which of a thumbnail takes no time.
-        opened.load()
-        return Picture(data, media_type, *opened.size)
-    opened.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
-    return encode_small(opened, most_bytes)
-
-
-def _opened(data: bytes, file_format: str) -> Image.Image:
-    with optional_import():
-        from PIL import Image, UnidentifiedImageError
-
-    try:
-        opened = Image.open(io.BytesIO(data), formats=[file_format])
-    except UnidentifiedImageError as error:
-        raise ValueError(f"data of a picture is no {file_format}") from error
-    if opened.width * opened.height > _MOST_PIXELS:
-        raise ValueError(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
-    return opened
-
-
-__all__ = ["THUMBNAIL_PX", "Chart", "Preview", "finished", "looked_closer", "preview", "sketch"]
-
-TEXT_CHARACTERS: Final = 30
+_TEXT_CHARACTERS: Final = 30
 _DETAIL_CHARACTERS: Final = 290
 _ROW_CHARACTERS: Final = 60
 _MOST_ROWS: Final = 4
+_CHARTS: Final = ("line", "bars", "points")
+# To decode more takes longer than a thumbnail may.
+_MOST_PIXELS: Final = 25_000_000
 
 # Each of these modules registers the kinds that it knows.
 _KINDS: Final = (arrays, objects)
@@ -93,34 +41,48 @@ def preview(value: Any, order: Order = "bgr") -> Preview:
 def sketch(value: Any, look: Look) -> Sketch:
     """Look at a value without making its thumbnail; never raises. What is looked at meanwhile is but named."""
     with looking() as is_nested:
-        if is_nested:
-            return Sketch(Preview(_kind(value), _kind(value)))
-        try:
-            return _checked(looker_of(type(value))(value, look), value, look)
-        except Exception as error:
-            return Sketch(_failed(Preview("", _kind(value)), "no preview", error))
+        return sketch_in_context(value, look, is_nested)
+
+
+def sketch_in_context(value: Any, look: Look, is_nested: bool) -> Sketch:
+    """Look at a value like ``sketch``, where several are looked at within one ``looking()``."""
+    if is_nested:
+        return Sketch(Preview(_kind(value), _kind(value)))
+    try:
+        return _checked(looker_of(type(value))(value, look), value, look)
+    except Exception as error:
+        return Sketch(_failed(Preview("", _kind(value)), "no preview", error))
 
 
 def looked_closer(sketched: Sketch) -> Sketch:
     """Return what is shown once there is room for a thumbnail, which is not made yet. Never raises."""
     with looking():
-        try:
-            return sketched if sketched.closer is None else _limited(sketched.closer())
-        except Exception as error:
-            return Sketch(_failed(sketched.shown, "no picture", error))
+        return _closer(sketched)
+
+
+def _closer(sketched: Sketch) -> Sketch:
+    try:
+        return sketched if sketched.closer is None else _limited(sketched.closer())
+    except Exception as error:
+        return Sketch(_failed(sketched.shown, "no picture", error))
 
 
 def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
     """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
-    sketched = looked_closer(sketched)
     with looking():
-        try:
-            drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
-        except Exception as error:
-            return _failed(sketched.shown, "no picture", error)
+        return finished_in_context(sketched, most_bytes)
+
+
+def finished_in_context(sketched: Sketch, most_bytes: int) -> Preview:
+    """Return a preview like ``finished``, where several are made within one ``looking()``."""
+    sketched = _closer(sketched)
+    try:
+        drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
+    except Exception as error:
+        return _failed(sketched.shown, "no picture", error)
     if isinstance(drawn, Chart):
         return replace(sketched.shown, chart=drawn)
-    return replace(sketched.shown, picture=drawn)
+    return sketched.shown if drawn is None else replace(sketched.shown, picture=drawn)
 
 
 def scene_in(sketched: Sketch) -> Scene | None:
@@ -139,13 +101,16 @@ def _limited(found: Sketch | Preview) -> Sketch:
 
 
 def _failed(shown: Preview, what: str, error: Exception) -> Preview:
-    said = f"{what}: {reason(error)}"
-    text = cut(said, TEXT_CHARACTERS) if not shown.text else shown.text
-    return replace(shown, text=text, detail=cut(f"{shown.detail}, {said}", _DETAIL_CHARACTERS))
+    message = f"{what}: {reason(error)}"
+    text = shown.text or cut(message, _TEXT_CHARACTERS)
+    return replace(shown, text=text, detail=cut(f"{shown.detail}, {message}", _DETAIL_CHARACTERS))
 
 
 def _kind(value: Any) -> str:
-    return cut(kind_name(type(value)), TEXT_CHARACTERS)
+    return cut(kind_name(type(value)), _TEXT_CHARACTERS)
+
+
+# -- what a user's preview function returned -----------------------------------------------------------------------
 
 
 def _checked(found: Any, value: Any, look: Look) -> Sketch:
@@ -164,7 +129,8 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
     if is_image(found):
         image = arrays.image_sketch(arrays.plain_array(found), look)
         detail = f"{_kind(value)}, shown as {image.shown.detail}"
-        return replace(image, shown=_trimmed(replace(image.shown, text=_kind(value), detail=detail)))
+        shown = _trimmed(replace(image.shown, text=_kind(value), detail=detail))
+        return replace(image, shown=shown, is_image=False)
     raise TypeError(f"a preview must be a text, an image or an ep.Preview, not {_kind(found)}")
 
 
@@ -173,9 +139,9 @@ def _trimmed(shown: Preview) -> Preview:
     rows = tuple(itertools.islice(shown.rows, _MOST_ROWS))
     if not all(issubclass(type(line), str) for line in (shown.text, shown.detail, *rows)):
         raise TypeError("text, detail and rows of a preview must be texts")
-    text = cut(plain_text(shown.text)[:500], TEXT_CHARACTERS)
+    text = cut(plain_text(shown.text)[:500], _TEXT_CHARACTERS)
     detail = cut(plain_text(shown.detail)[:1000], _DETAIL_CHARACTERS)
-    return replace(shown, text=text or "(empty text)", detail=detail, rows=tuple(map(_on_one_line, rows)))
+    return Preview(text or "(empty text)", detail, shown.picture, shown.chart, tuple(map(_on_one_line, rows)))
 
 
 def _on_one_line(row: str) -> str:
@@ -187,8 +153,37 @@ def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | Non
     if picture is not None:
         if not issubclass(type(picture), Picture):
             raise TypeError("picture must be an image: an array of at least 8 x 8 pixels")
-        return lambda most_bytes: checked_picture(picture, most_bytes)
+        return lambda most_bytes: _checked_picture(picture, most_bytes)
     if chart is None:
         return None
-    checked = checked_chart(chart)
+    checked = _checked_chart(chart)
     return (lambda most_bytes: checked) if checked.series else None
+
+
+def _checked_chart(chart: Any) -> Chart:
+    """Return a chart within the limits: of finite points, each between 0 and 1."""
+    if type(chart) is not Chart or chart.kind not in _CHARTS:
+        raise TypeError(f"chart of a preview must be a Chart of kind {', '.join(_CHARTS)}")
+    room, series = MOST_POINTS, []
+    for points in itertools.islice(chart.series, MOST_POINTS):
+        pairs = [(float(x), float(y)) for x, y in itertools.islice(points, room)]
+        room -= len(pairs)
+        kept = tuple((min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)) for x, y in pairs if math.isfinite(x + y))
+        series += [kept] * bool(kept)
+    return Chart(chart.kind, tuple(series[:MOST_LINES]))
+
+
+def _checked_picture(picture: Picture, most_bytes: int) -> Picture:
+    """Return a picture within the limits of a thumbnail; what it is, its bytes decide."""
+    with optional_import():
+        from PIL import Image
+
+    with Image.open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
+        if opened.width * opened.height > _MOST_PIXELS:
+            raise ValueError(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
+        # What is broken is found by decoding it.
+        opened.load()
+        if max(opened.size) <= THUMBNAIL_PX and len(picture.data) <= most_bytes:
+            return Picture(picture.data, f"image/{opened.format}".lower(), *opened.size)
+        opened.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+        return encode_small(opened, most_bytes)

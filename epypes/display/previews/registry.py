@@ -1,4 +1,4 @@
-"""Which function looks at a value of this type?
+"""The registry of functions that look at values, by type.
 
 Kinds are classes or their dotted names, so that a package is known without being imported. A value is looked at by the
 function of the first class in its method resolution order that has one.
@@ -20,16 +20,18 @@ Looker = Callable[[Any, Look], Any]
 _Looker = TypeVar("_Looker", bound=Looker)
 
 
-class Registry:
+class _Registry:
     """Functions by class, and by a class's dotted name."""
 
     def __init__(self) -> None:
         # Weak, so that a class of a notebook that was defined again can go.
         self._by_class: WeakKeyDictionary[type, Looker] = WeakKeyDictionary()
         self._by_name: dict[str, Looker] = {}
+        self.revision = 0
 
     def add(self, kind: type | str, looker: Looker) -> None:
         """Take a function for a class or a dotted name; it replaces an earlier one."""
+        self.revision += 1
         if isinstance(kind, type):
             self._by_class[kind] = looker
         else:
@@ -37,21 +39,30 @@ class Registry:
 
     def get(self, kind: type) -> Looker | None:
         """Return the function of this very class."""
-        found = self._by_class.get(kind)
-        return found or self._by_name.get(dotted_name(kind))
+        return self._by_class.get(kind) or self._by_name.get(dotted_name(kind))
 
 
-OURS: Final = Registry()
-_users: Final = Registry()
+_ours: Final = _Registry()
+_users: Final = _Registry()
 
 
 def looker_of(kind: type) -> Looker:
     """Return the function that looks at values of a class; of two for one class, the user's."""
     for parent in parents(kind):
-        found = _users.get(parent) or OURS.get(parent)
+        found = _users.get(parent) or _ours.get(parent)
         if found is not None:
             return found
     raise TypeError(f"nothing is registered for {kind_name(kind)}")
+
+
+def is_shown_by_user(kind: type) -> bool:
+    """Whether a user's function looks at values of a class, or of one of its parents."""
+    return any(map(_users.get, parents(kind)))
+
+
+def users_revision() -> int:
+    """Return how often a user has registered a function."""
+    return _users.revision
 
 
 def ours(*kinds: type | str) -> Callable[[_Looker], _Looker]:
@@ -59,7 +70,7 @@ def ours(*kinds: type | str) -> Callable[[_Looker], _Looker]:
 
     def register(looker: _Looker) -> _Looker:
         for kind in kinds:
-            OURS.add(kind, looker)
+            _ours.add(kind, looker)
         return looker
 
     return register

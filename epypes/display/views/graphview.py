@@ -26,8 +26,7 @@ FunctionState = Literal[
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class TokenView:
+class TokenView(NamedTuple):
     """What is to be seen of a token.
 
     Attributes
@@ -48,8 +47,7 @@ class TokenView:
     first: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class FunctionView:
+class FunctionView(NamedTuple):
     """What is to be seen of a function.
 
     Attributes
@@ -79,8 +77,7 @@ class FunctionView:
     source: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class StageView:
+class StageView(NamedTuple):
     """What is to be seen of one stage of a reactive pipeline, outside its graph.
 
     Attributes
@@ -170,7 +167,7 @@ class GroupView:
 
 
 def to_json(graph: GraphView) -> dict[str, Any]:
-    """Return a view as what ``json.dumps`` takes."""
+    """Return a view as what ``json.dumps`` takes: a record is an object by the names of its fields, a picture a URI."""
     written: dict[str, Any] = _written(graph)
     return written
 

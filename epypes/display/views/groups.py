@@ -204,7 +204,7 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
 def _without_thumbnail(token: TokenView) -> TokenView:
     if token.preview is None:
         return token
-    return replace(token, preview=replace(token.preview, picture=None, chart=None, rows=()))
+    return token._replace(preview=replace(token.preview, picture=None, chart=None, rows=()))
 
 
 def function_count(graph: GraphView) -> int:

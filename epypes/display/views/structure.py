@@ -261,8 +261,3 @@ def _redefined_caption(cg: CompGraph, names: list[str]) -> str:
 def _redefined_name(cg: CompGraph, name: str) -> str:
     inside = "a function inside " * is_redefined_inside(cg.functions[name])
     return f"{inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
-
-
-def with_caption(text: str, structure: GraphView) -> str:
-    """Return a caption that begins with this text and goes on with the structure's own."""
-    return f"{text}. {structure.caption}" if structure.caption else text

@@ -13,7 +13,8 @@ from typing import Any, Final
 
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.features import are_keypoints
-from epypes.display.previews.images import Range, image_kind, is_image, kept_range, sampled
+from epypes.display.previews.images import Range, image_kind, is_image, sampled
+from epypes.display.previews.kept import kept_range
 from epypes.display.previews.model import Backdrop, Look, Marks, Most, Scene
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
