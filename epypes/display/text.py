@@ -1,8 +1,11 @@
-"""Text of a picture: escaped, cut to what it may take, and measured in the bytes of a page."""
+"""Text of a picture: escaped, cut to what it may take, and measured in the bytes of a page.
+
+A saved notebook keeps every picture twice, and is read, compared and sent: so many functions take so much room, as SVG
+and as HTML, and no more.
+"""
 
 from __future__ import annotations
 
-import html
 import re
 import textwrap
 from typing import Final
@@ -14,52 +17,51 @@ THUMBNAIL_CHARACTERS: Final = 80_000
 # More are no overview.
 MOST_THUMBNAILS: Final = 24
 
-
 # detect_and_describe_features_1, of the paper's figure 13, is to fit.
 _NAME_CHARACTERS: Final = 32
 # What such a name takes at most in a page.
 _NAME_ROOM: Final = 110
 # What XML 1.0 allows; a control character or half a surrogate pair in a name would make the whole picture unreadable.
 _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
-
-
 # What takes more characters in a page, where a picture is part of an address: an ampersand stands there as "%26amp;".
 _LONGER: Final = {"&": 7, "<": 6, ">": 6, '"': 5, "%": 3, "#": 3}
 _LONG: Final = re.compile(r"[&<>\"%#]|[^\x20-\x7e]")
 # A quote in a text. In a page, where a picture is part of an address, it takes less room than its other name.
 QUOTE: Final = "&#34;"
+_CONTENT: Final = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': QUOTE})
+_ATTRIBUTE: Final = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "'": "&#x27;"})
 
 
 def escape(text: str) -> str:
     """Return text for attributes of SVG and HTML; what XML forbids shows as a replacement mark."""
-    return html.escape(_allowed(text))
+    return (text if text.isprintable() else _NOT_XML.sub("\ufffd", text)).translate(_ATTRIBUTE)
 
 
 def content(text: str) -> str:
     """Return text as the content of an element of SVG and HTML, where an apostrophe is nothing special."""
-    return html.escape(_allowed(text), quote=False).replace('"', QUOTE)
+    return (text if text.isprintable() else _NOT_XML.sub("\ufffd", text)).translate(_CONTENT)
 
 
-def _allowed(text: str) -> str:
-    # What is printable is allowed; most texts are, and to ask takes a tenth of the time.
-    return text if text.isprintable() else _NOT_XML.sub("\ufffd", text)
+def size(text: str) -> int:
+    """Return how many bytes a text takes in a file."""
+    return len(text) if text.isascii() else len(text.encode(errors="replace"))
+
+
+def written_length(text: str) -> int:
+    """Return how many bytes a text takes in a page at most."""
+    longer = _LONG.findall(text)
+    return len(text) + sum(_LONGER.get(sign, size(_NOT_XML.sub("\ufffd", sign))) - 1 for sign in longer)
+
+
+def _one_line(text: str) -> str:
+    # The blank is the only blank that is printable.
+    return text if text.isprintable() and "  " not in text and text.strip() == text else " ".join(text.split())
 
 
 def cut(text: str, characters: int) -> str:
     """Return text on one line, of at most so many characters."""
     text = _one_line(text)
     return text if len(text) <= characters else text[: characters - 1] + "…"
-
-
-def size(text: str) -> int:
-    """Return how many bytes a text takes in a file."""
-    return len(text) if text.isascii() else len(text.encode())
-
-
-def written_length(text: str) -> int:
-    """Return how many bytes a text takes in a page at most."""
-    longer = _LONG.findall(text)
-    return len(text) + sum(_LONGER.get(sign, size(_allowed(sign))) - 1 for sign in longer)
 
 
 def fitted(text: str, room: int) -> str:
@@ -78,13 +80,8 @@ def wrapped(text: str, characters: int, lines: int) -> tuple[str, ...]:
     return tuple(textwrap.wrap(beginning, characters, max_lines=lines, placeholder="…"))
 
 
-def _one_line(text: str) -> str:
-    # The blank is the only blank that is printable.
-    return text if text.isprintable() and "  " not in text and text.strip() == text else " ".join(text.split())
-
-
 def cut_name(name: str, characters: int) -> str:
-    """Return a name on one line, of at most so many characters; its end is kept, since suffixes tell names apart."""
+    """Return a name on one line, of at most so many characters; its end is kept, since names may differ there only."""
     name = _one_line(name)
     if len(name) <= characters:
         return name
@@ -95,7 +92,7 @@ def cut_name(name: str, characters: int) -> str:
 def short_name(name: str) -> str:
     """Return a name as it stands on a vertex."""
     short, characters = cut_name(name, _NAME_CHARACTERS), _NAME_CHARACTERS
-    while written_length(short) > _NAME_ROOM:
+    while _LONG.search(short) and written_length(short) > _NAME_ROOM:
         characters = characters * 3 // 4
         short = cut_name(name, characters)
     return short

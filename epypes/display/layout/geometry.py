@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 Direction = Literal["down", "right"]
@@ -18,7 +19,8 @@ class Box(NamedTuple):
     height: float
 
 
-class Layout(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Layout:
     """A laid-out graph; all lengths in pixels, y downwards.
 
     Attributes
@@ -35,3 +37,7 @@ class Layout(NamedTuple):
     height: float
     centres: tuple[Point, ...]
     splines: tuple[tuple[Point, ...], ...]
+
+    def __hash__(self) -> int:
+        # Of a kept layout. To hash thousands of numbers takes longer than to paint them.
+        return id(self)

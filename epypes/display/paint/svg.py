@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Final
 
-from epypes.display.layout.geometry import Box, Layout, Point
+from epypes.display.layout.geometry import Edge, Layout, Point
 from epypes.display.layout.placement import lay_out
 from epypes.display.paint.stages import paint_around
 from epypes.display.paint.style import STYLE
@@ -20,7 +21,8 @@ from epypes.wording import counted
 _OFF: Final = " off"
 
 
-def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layout: Layout) -> Iterator[str]:
+@lru_cache(maxsize=128)
+def paint_edges(edges: tuple[EdgeView, ...], ends: tuple[Edge, ...], layout: Layout) -> str:
     """Paint the edges, those that no run uses first and dashed.
 
     All of one kind are one path: a graph has many.
@@ -34,12 +36,14 @@ def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layo
     layout
         Without splines in a dense graph.
     """
+    painted = []
     for is_live, kind in ((False, _OFF), (True, "")):
         places = [place for place, edge in enumerate(edges) if edge.is_live == is_live]
         if places and layout.splines:
-            yield _paint_splines([layout.splines[place] for place in places], kind)
+            painted.append(_paint_splines([layout.splines[place] for place in places], kind))
         elif places:
-            yield _paint_lines([ends[place] for place in places], layout, kind)
+            painted.append(_paint_lines([ends[place] for place in places], layout, kind))
+    return "\n".join(painted)
 
 
 def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
@@ -136,17 +140,14 @@ def paint_svg(graph: GraphView) -> str:
     LayoutUnavailable
         No Graphviz engine answered.
     """
-    functions = len(graph.functions)
-    boxes = (
-        *(function_box(function, graph.direction) for function in graph.functions),
-        *map(token_box, graph.tokens),
-    )
-    edges = tuple(
-        (functions + edge.token, edge.function) if edge.is_input else (edge.function, functions + edge.token)
-        for edge in graph.edges
-    )
-    is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
-    layout = lay_out(boxes, edges, is_dense, graph.direction)
+    functions, direction = len(graph.functions), graph.direction
+    function_boxes = [function_box(function, direction) for function in graph.functions]
+    boxes = (*function_boxes, *map(token_box, graph.tokens))
+    ends = tuple([
+        (functions + token, function) if is_input else (function, functions + token)
+        for function, token, is_input, _ in graph.edges
+    ])  # fmt: skip
+    layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction)
     around, bounds = paint_around(graph, layout)
     width, height = bounds.right - bounds.left + 2 * _MARGIN, bounds.bottom - bounds.top + 2 * _MARGIN
     size = f"{width:.0f}", f"{height:.0f}"
@@ -157,11 +158,15 @@ def paint_svg(graph: GraphView) -> str:
         f'style="min-width:{_LEAST_SCALE * width:.0f}px">'
     )
     parts = [head, f"<style>{STYLE}</style>", *around]
-    if graph.draws_edges:
-        parts += paint_edges(graph.edges, edges, layout)
-    parts += _paint_vertices(graph, boxes, layout)
-    parts.append("</svg>")
-    return "\n".join(parts)
+    if graph.draws_edges and ends:
+        parts.append(paint_edges(graph.edges, ends, layout))
+    centres = layout.centres
+    parts += [
+        paint_function(function, *placed, direction)
+        for function, placed in zip(graph.functions, zip(boxes, centres, strict=True), strict=False)
+    ]
+    parts += map(paint_token, graph.tokens, boxes[functions:], centres[functions:])
+    return "\n".join([*parts, "</svg>"])
 
 
 def least_width(svg: str) -> str:
@@ -182,11 +187,3 @@ def alt_text(graph: GraphView) -> str:
     stages += [short_name(stage.name) for stage in graph.after]
     through = f", events go through {', '.join(stages)}" if stages else ""
     return f"Pipeline {short_name(graph.title)}{through}. {said}"
-
-
-def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
-    functions = len(graph.functions)
-    for function, box, centre in zip(graph.functions, boxes, layout.centres, strict=False):
-        yield paint_function(function, box, centre, graph.direction)
-    for token, box, centre in zip(graph.tokens, boxes[functions:], layout.centres[functions:], strict=True):
-        yield paint_token(token, box, centre)

@@ -1,10 +1,9 @@
-"""Times of one run and of many as bars."""
+"""Times of one run and of many: as bars, and as the rows of a table."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from collections.abc import Iterable, Iterator
+from typing import Final, Literal, NamedTuple
 
 from epypes.display.paint.style import STYLE, page_style, paper_style
 from epypes.display.text import content, cut_name, duration_text, escape, overhead_text, short_name
@@ -22,8 +21,7 @@ _SUMMARY_LEGEND: Final = "Bars: the median time of each function; lines: 5 % to 
 _LONGEST_RANGE: Final = 4.0
 
 
-@dataclass(frozen=True, slots=True)
-class TimeBar:
+class TimeBar(NamedTuple):
     """What is to be seen of one time, or of many of one kind.
 
     Attributes
@@ -31,7 +29,9 @@ class TimeBar:
     text
         Stands beside the bar.
     title
-        Says all of it in words.
+        All of it in words.
+    cells
+        What stands beside the name in a table.
     length
         From 0 to 1, the longest one.
     low, high
@@ -46,6 +46,7 @@ class TimeBar:
     name: str
     text: str
     title: str
+    cells: tuple[str, ...]
     length: float = 0.0
     low: float = 0.0
     high: float = 0.0
@@ -53,117 +54,93 @@ class TimeBar:
     is_failed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class TimesView:
-    """What is to be seen of times: bars in run order, then graph overhead and total; ``legend`` says what bars mean."""
+class TimesView(NamedTuple):
+    """What is to be seen of times: bars in run order, then graph overhead and total; ``legend`` explains the bars."""
 
     caption: str
     legend: str
     bars: tuple[TimeBar, ...]
 
 
-def report_caption(report: RunReport) -> str:
+def _named(kind: BarKind, name: str) -> str:
+    return f"function {cut_name(name, _TITLE_CHARACTERS)}" if kind == "function" else name
+
+
+# -- one run -------------------------------------------------------------------------------------------------------
+
+
+def report_times(report: RunReport, most: int = MOST_BARS) -> TimesView:
+    """Look at the times of a run; of many functions at those that took longest, and at the rest as one.
+
+    A function that failed is always among them.
+    """
+    entries, total_ns = report.functions, max(report.total_ns, 1)
+    longest = sorted(entries, key=lambda entry: (not entry.failed, -entry.duration_ns))
+    kept, rest = {entry.function for entry in longest[:most]}, longest[most:]
+    bars = [_function_bar(entry, total_ns) for entry in entries if entry.function in kept]
+    if rest:
+        text = f"{counted(len(rest), 'function')} more, {sum(not entry.ran for entry in rest)} of them reused"
+        bars.append(_bar("rest", text, sum(entry.duration_ns for entry in rest), total_ns))
+    bars.append(_bar("overhead", overhead_text(report.side_by_side), report.overhead_ns, total_ns))
+    scale = max((bar.length for bar in bars), default=0.0) or 1.0
+    total = duration_text(report.total_ns)
+    return TimesView(
+        _report_caption(entries),
+        _REPORT_LEGEND,
+        (
+            *(bar._replace(length=bar.length / scale) for bar in bars),
+            TimeBar("total", "in all", total, f"in all: {total}", (total, "")),
+        ),
+    )
+
+
+def _report_caption(entries: tuple[FunctionTime, ...]) -> str:
     """Return how many functions of a run ran to their end, how many were reused, and whether one failed."""
-    entries = report.functions
     failed = sum(entry.failed for entry in entries)
     reused = sum(not entry.ran for entry in entries)
     ran = counted(len(entries) - reused - failed, "function")
     return f"{ran} ran, {reused} reused{f', {failed} failed' * failed}"
 
 
-def summary_caption(summary: TimingSummary) -> str:
-    """Return how many runs were summarized, and how."""
-    left_out = f", {counted(summary.failed_runs, 'failed run')} left out" * bool(summary.failed_runs)
-    return f"{counted(summary.runs, 'run')}{left_out}; log-normal distributions"
-
-
-def failed_text(entry: FunctionTime) -> str:
-    """Return what is said of a function that failed."""
-    return f"failed after {duration_text(entry.duration_ns)}"
-
-
-def longest_first(entries: Sequence[FunctionTime]) -> list[FunctionTime]:
-    """Return a run's functions, those first that are to be seen: one that failed, then those that took longest."""
-    return sorted(entries, key=lambda entry: (not entry.failed, -entry.duration_ns))
-
-
-def report_times(report: RunReport) -> TimesView:
-    """Look at the times of a run; of many functions at those that took longest, and at the rest as one.
-
-    A function that failed is always among them.
-    """
-    entries, total_ns = report.functions, max(report.total_ns, 1)
-    longest = longest_first(entries)
-    kept = {entry.function for entry in longest[:MOST_BARS]}
-    bars = [_function_bar(entry, total_ns) for entry in entries if entry.function in kept]
-    bars += _rest_bar(longest[MOST_BARS:], total_ns)
-    bars.append(_bar("overhead", overhead_text(report.side_by_side), report.overhead_ns, total_ns))
-    scale = max((bar.length for bar in bars), default=0.0) or 1.0
-    scaled = [replace(bar, length=bar.length / scale) for bar in bars]
-    total = duration_text(report.total_ns)
-    bars = [*scaled, TimeBar("total", "in all", total, f"in all: {total}")]
-    return TimesView(report_caption(report), _REPORT_LEGEND, tuple(bars))
-
-
 def _function_bar(entry: FunctionTime, total_ns: int) -> TimeBar:
-    if entry.ran:
-        bar = _bar("function", entry.function, entry.duration_ns, total_ns)
-        return _as_failed(bar, entry) if entry.failed else bar
-    return TimeBar(
-        "function", short_name(entry.function), "reused", f"{_named(entry.function)}: reused", is_reused=True
-    )
-
-
-def _as_failed(bar: TimeBar, entry: FunctionTime) -> TimeBar:
-    text = failed_text(entry)
-    return replace(bar, text=text, title=f"{_named(entry.function)}: {text}", is_failed=True)
+    named = _named("function", entry.function)
+    if not entry.ran:
+        return TimeBar("function", entry.function, "reused", f"{named}: reused", ("reused", ""), is_reused=True)
+    bar = _bar("function", entry.function, entry.duration_ns, total_ns)
+    if not entry.failed:
+        return bar
+    text = f"failed after {duration_text(entry.duration_ns)}"
+    return bar._replace(text=text, title=f"{named}: {text}", cells=(text, bar.cells[1]), is_failed=True)
 
 
 def _bar(kind: BarKind, name: str, spent_ns: int, total_ns: int) -> TimeBar:
     """Return a bar whose length is its part of the run's time."""
-    text = f"{duration_text(spent_ns)}, {spent_ns / total_ns:.0%}"
-    shown, named = (short_name(name), _named(name)) if kind == "function" else (name, name)
-    return TimeBar(kind, shown, text, f"{named}: {text} of the run", max(spent_ns / total_ns, 0.0))
+    cells = duration_text(spent_ns), f"{spent_ns / total_ns:.0%}"
+    text = ", ".join(cells)
+    return TimeBar(kind, name, text, f"{_named(kind, name)}: {text} of the run", cells, max(spent_ns / total_ns, 0.0))
 
 
-def _named(name: str) -> str:
-    return f"function {cut_name(name, _TITLE_CHARACTERS)}"
+# -- many runs -----------------------------------------------------------------------------------------------------
 
 
-def _rest_bar(rest: Sequence[FunctionTime], total_ns: int) -> Iterable[TimeBar]:
-    if rest:
-        yield _bar("rest", rest_text(rest), sum(entry.duration_ns for entry in rest), total_ns)
-
-
-def rest_text(rest: Sequence[FunctionTime]) -> str:
-    """Return what is said of functions that are not shown one by one."""
-    return f"{counted(len(rest), 'function')} more, {sum(not entry.ran for entry in rest)} of them reused"
-
-
-def summary_times(summary: TimingSummary) -> TimesView:
+def summary_times(summary: TimingSummary, most: int = MOST_BARS) -> TimesView:
     """Look at the times of many runs; of many functions at those that take longest."""
     functions = summary.functions
-    kept = set(sorted(functions, key=lambda name: -median_ns(functions[name]))[:MOST_BARS])
+    kept = set(sorted(functions, key=lambda name: -_median_ns(functions[name]))[:most])
     scale = _scale_ns(fitted for fitted in (*functions.values(), summary.overhead) if fitted.is_fitted)
     bars = [_fitted_bar("function", name, functions[name], scale) for name in functions if name in kept]
     if len(functions) > len(kept):
-        said = f"{counted(len(functions) - len(kept), 'function')} more, which take less"
-        bars.append(TimeBar("rest", said, "", said))
+        text = f"{counted(len(functions) - len(kept), 'function')} more, which take less"
+        bars.append(TimeBar("rest", text, "", text, ("", "", "", "")))
     bars.append(_fitted_bar("overhead", overhead_text(summary.side_by_side), summary.overhead, scale))
-    total = _fitted_bar("total", "in all", summary.total, scale)
-    bars.append(replace(total, length=0.0, low=0.0, high=0.0))
-    return TimesView(summary_caption(summary), _SUMMARY_LEGEND, tuple(bars))
+    bars.append(_fitted_bar("total", "in all", summary.total, scale)._replace(length=0.0, low=0.0, high=0.0))
+    left_out = f", {counted(summary.failed_runs, 'failed run')} left out" * bool(summary.failed_runs)
+    caption = f"{counted(summary.runs, 'run')}{left_out}; log-normal distributions"
+    return TimesView(caption, _SUMMARY_LEGEND, tuple(bars))
 
 
-def median_ns(fitted: LogNormal) -> float:
-    """Return the median, 0 where nothing was fitted."""
+def _median_ns(fitted: LogNormal) -> float:
     return fitted.median_ns if fitted.is_fitted else 0.0
-
-
-def range_text(fitted: LogNormal) -> str:
-    """Return between which times nine of ten are."""
-    low, high = (duration_text(round(fitted.quantile_ns(share))) for share in (0.05, 0.95))
-    return f"{low} to {high}"
 
 
 def _scale_ns(fitted: Iterable[LogNormal]) -> float:
@@ -174,17 +151,24 @@ def _scale_ns(fitted: Iterable[LogNormal]) -> float:
 
 
 def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) -> TimeBar:
-    shown, named = (short_name(name), _named(name)) if kind == "function" else (name, name)
+    named = _named(kind, name)
     if not fitted.is_fitted:
-        return TimeBar(kind, shown, "no positive value", f"{named}: no positive value")
-    median = duration_text(round(fitted.median_ns))
+        cells = str(fitted.count), "no positive value", "", ""
+        return TimeBar(kind, name, "no positive value", f"{named}: no positive value", cells)
+    mode, median = (duration_text(round(time_ns)) for time_ns in (fitted.mode_ns, fitted.median_ns))
+    count = f"{fitted.count}{f', {fitted.not_positive} not positive' * bool(fitted.not_positive)}"
     runs, length = f"in {counted(fitted.count, 'run')}", min(fitted.median_ns / scale_ns, 1.0)
     if not fitted.has_range:
-        return TimeBar(kind, shown, median, f"{named}: median {median}, {runs}", length)
-    title = f"{named}: median {median}, 5 % to 95 % {range_text(fitted)}, {runs}"
-    low, high = (min(fitted.quantile_ns(share) / scale_ns, 1.0) for share in (0.05, 0.95))
-    return TimeBar(kind, shown, f"{median} ({range_text(fitted)})", title, length, low, high)
+        title = f"{named}: median {median}, {runs}"
+        return TimeBar(kind, name, median, title, (count, mode, median, ""), length)
+    ends_ns = [fitted.quantile_ns(share) for share in (0.05, 0.95)]
+    span = " to ".join(duration_text(round(end)) for end in ends_ns)
+    title = f"{named}: median {median}, 5 % to 95 % {span}, {runs}"
+    low, high = (min(end / scale_ns, 1.0) for end in ends_ns)
+    return TimeBar(kind, name, f"{median} ({span})", title, (count, mode, median, span), length, low, high)
 
+
+# -- painting ------------------------------------------------------------------------------------------------------
 
 _ROW_PX: Final = 22
 _BAR_PX: Final = 12
@@ -219,9 +203,9 @@ def times_alt_text(times: TimesView) -> str:
 
 def paint_bars(times: TimesView) -> str:
     """Paint times as one bar below another; the same times give the same text."""
-    names = max(len(bar.name) for bar in times.bars) * _NAME_CHARACTER_PX
+    names = [short_name(bar.name) if bar.kind == "function" else bar.name for bar in times.bars]
+    left = _MARGIN_PX + max(map(len, names)) * _NAME_CHARACTER_PX + _GAP_PX
     texts = max(len(bar.text) for bar in times.bars) * _TEXT_CHARACTER_PX
-    left = _MARGIN_PX + names + _GAP_PX
     width, height = left + _LONGEST_PX + _GAP_PX + texts + _MARGIN_PX, _ROW_PX * len(times.bars) + _MARGIN_PX
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph epypes-times" role="figure" '
@@ -229,16 +213,19 @@ def paint_bars(times: TimesView) -> str:
         f'viewBox="-1 -1 {width + 2:.0f} {height + 2:.0f}">'
     )
     paper = f'<rect class="shape" width="{width:.0f}" height="{height:.0f}" rx="8"/>'
-    rows = (_paint_row(bar, left, _MARGIN_PX / 2 + place * _ROW_PX) for place, bar in enumerate(times.bars))
+    rows = (
+        _paint_row(bar, name, left, _MARGIN_PX / 2 + place * _ROW_PX)
+        for place, (bar, name) in enumerate(zip(times.bars, names, strict=True))
+    )
     return "\n".join([head, f"<style>{_STYLE}</style>", paper, *rows, "</svg>"])
 
 
-def _paint_row(bar: TimeBar, left: float, top: float) -> str:
+def _paint_row(bar: TimeBar, name: str, left: float, top: float) -> str:
     base = top + _ROW_PX / 2 + 4
     classes = f"{bar.kind}{' reused' * bar.is_reused}{' failed' * bar.is_failed}"
     return (
         f'<g class="time {classes}"><title>{content(bar.title)}</title>'
-        f'<text class="name" x="{_MARGIN_PX}" y="{base:.0f}">{content(bar.name)}</text>'
+        f'<text class="name" x="{_MARGIN_PX}" y="{base:.0f}">{content(name)}</text>'
         f"{''.join(_paint_bar(bar, left, top))}"
         f'<text x="{left + _LONGEST_PX + _GAP_PX:.0f}" y="{base:.0f}">{content(bar.text)}</text></g>'
     )
