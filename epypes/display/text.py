@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from functools import lru_cache
 from typing import Final
 
 CHARACTERS: Final = 20_000
@@ -53,14 +54,9 @@ def written_length(text: str) -> int:
     return len(text) + sum(_LONGER.get(sign, size(_NOT_XML.sub("\ufffd", sign))) - 1 for sign in longer)
 
 
-def _one_line(text: str) -> str:
-    # The blank is the only blank that is printable.
-    return text if text.isprintable() and "  " not in text and text.strip() == text else " ".join(text.split())
-
-
 def cut(text: str, characters: int) -> str:
     """Return text on one line, of at most so many characters."""
-    text = _one_line(text)
+    text = " ".join(text.split())
     return text if len(text) <= characters else text[: characters - 1] + "…"
 
 
@@ -82,13 +78,14 @@ def wrapped(text: str, characters: int, lines: int) -> tuple[str, ...]:
 
 def cut_name(name: str, characters: int) -> str:
     """Return a name on one line, of at most so many characters; its end is kept, since names may differ there only."""
-    name = _one_line(name)
+    name = " ".join(name.split())
     if len(name) <= characters:
         return name
     end = characters // 3
     return f"{name[: characters - end - 1]}…{name[len(name) - end :]}"
 
 
+@lru_cache(maxsize=1_000)
 def short_name(name: str) -> str:
     """Return a name as it stands on a vertex."""
     short, characters = cut_name(name, _NAME_CHARACTERS), _NAME_CHARACTERS

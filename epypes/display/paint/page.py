@@ -98,8 +98,9 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     pictures = [(graph, svg), *((group.graph, paint_svg(group.graph)) for group in graph.groups)]
     room = _room_of(pictures) - taken - size(_left_out(names))
     figures: list[str] = []
-    for name, (part, picture) in zip(("", *names), pictures, strict=True):
-        figure = paint_figure(picture, alt_text(part), part.caption)
+    alts = [alt_text(part) for part, _ in pictures]
+    for name, alt, (part, picture) in zip(("", *names), alts, pictures, strict=True):
+        figure = paint_figure(picture, alt, part.caption)
         least = size(_inside(name, part, figure) if figures else figure) + size(_data(part, {})) + _TWIN_CHARACTERS
         if figures and least > room:
             break
@@ -109,19 +110,21 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     # What is left is for twins and sources: as much for each function and token.
     each = max(room, 0) / max(sum(map(_vertices, parts)), 1)
     first, *insides = [
-        _explained(figure, part, int(each * _vertices(part))) for figure, part in zip(figures, parts, strict=True)
+        _explained(figure, part, alt, int(each * _vertices(part)))
+        for figure, part, alt in zip(figures, parts, alts, strict=False)
     ]
     details = [_inside(name, part, figure) for name, part, figure in zip(names, parts[1:], insides, strict=False)]
-    return [first, *details, _left_out(names[len(details) :])]
+    left_out = _left_out(names[len(details) :])
+    return [first, *details, *([left_out] if left_out else [])]
 
 
-def _explained(figure: str, graph: GraphView, room: int) -> str:
+def _explained(figure: str, graph: GraphView, alt: str, room: int) -> str:
     """Add the twin of a figure and what the script needs to know, in ``room`` more characters than is their least."""
     # A fifth at least is kept for the rows of the twin.
     sources = _fitting(graph, room * 4 // 5)
     data = _data(graph, sources)
     room += _TWIN_CHARACTERS - len(_STILL) - sum(map(_source_size, sources))
-    return f"{figure.removesuffix(_END)}{_STILL}{data}{paint_twin(graph, alt_text(graph), room)}{_END}"
+    return f"{figure.removesuffix(_END)}{_STILL}{data}{paint_twin(graph, alt, room)}{_END}"
 
 
 def _inside(name: str, graph: GraphView, figure: str) -> str:

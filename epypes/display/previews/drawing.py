@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.encoding import THUMBNAIL_PX, Picture, encode_image, encode_small, pillow_image
+from epypes.display.previews.encoding import THUMBNAIL_PX, Picture, encode_image, encode_small, pillow, pillow_image
 from epypes.display.previews.images import image_kind, sampled, some_of
 from epypes.display.previews.model import Backdrop, Chart, Marks, Most, Scene
 from epypes.optional import optional_import
@@ -288,12 +288,9 @@ def _drawn_over(backdrop: Backdrop, marks: Marks, side: int = THUMBNAIL_PX) -> I
 def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image.Image:
     import numpy as np
 
-    with optional_import():
-        from PIL import Image
-
     side = THUMBNAIL_PX * _OVERSAMPLED // 2
     (left, left_scale), (right, right_scale) = (_canvas(backdrop, side) for backdrop in backdrops)
-    canvas = Image.new("RGB", (2 * side, max(left.height, right.height)))
+    canvas: Image.Image = pillow().new("RGB", (2 * side, max(left.height, right.height)))
     canvas.paste(left, (side - left.width, 0))
     canvas.paste(right, (side, 0))
     pen = _Pen(canvas)
@@ -309,14 +306,11 @@ def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image
 
 def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     """Return an image to be drawn upon, a little darker, and how many of its pixels are one of the image."""
-    with optional_import():
-        from PIL import Image
-
     array, picture = backdrop.image, _picture(backdrop, side)
     scale = side / max(array.shape[:2])
     # Even sides, so that each pixel of the thumbnail is made of four.
     height, width = (max(1, round(length * scale / _OVERSAMPLED)) * _OVERSAMPLED for length in array.shape[:2])
-    picture = picture.resize((width, height), Image.Resampling.BILINEAR)
+    picture = picture.resize((width, height), pillow().Resampling.BILINEAR)
     return picture.point(lambda level: round(level * _DARKER)), scale
 
 

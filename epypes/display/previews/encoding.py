@@ -47,17 +47,23 @@ def palette() -> bytes:
     return bytes(colours) + b"\xff\xff\xff"
 
 
+@functools.cache
+def pillow() -> Any:
+    """Return Pillow's module ``Image``."""
+    with optional_import():
+        from PIL import Image
+
+    return Image
+
+
 def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
     """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
     import numpy as np
 
-    with optional_import():
-        from PIL import Image
-
     stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
     kept = labels[::stride, ::stride]
     numbers = np.where(kept > 0, (kept.astype(np.int64) - 1) % _LABEL_COLOURS + 1, np.where(kept < 0, _WHITE, 0))
-    picture = Image.fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
+    picture: Image.Image = pillow().fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
     picture.putpalette(palette())
     return picture
 
@@ -203,17 +209,15 @@ def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES, *, has
 
 def _attempts(picture: Image.Image) -> Iterator[tuple[Image.Image, int]]:
     """Yield pictures of ever fewer bytes, with the quality of their JPEG."""
-    with optional_import():
-        from PIL import Image
-
-    sharp = Image.Resampling.NEAREST if picture.mode in ("1", "P") else Image.Resampling.BOX
+    pil = pillow()
+    sharp = pil.Resampling.NEAREST if picture.mode in ("1", "P") else pil.Resampling.BOX
     if picture.mode in ("L", "RGB"):
         for quality in _QUALITIES:
             yield picture, quality
     small = picture
     while max(small.size) * 3 // 4 >= _LEAST_SIDE_PX:
         if picture.mode == "RGBA":
-            yield small.quantize(_COLOURS, Image.Quantize.FASTOCTREE), 0
+            yield small.quantize(_COLOURS, pil.Quantize.FASTOCTREE), 0
         small = picture.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)), sharp)
         yield small, _QUALITIES[-1]
 
@@ -244,36 +248,25 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
 
 
 def _pillow(image: npt.NDArray[np.uint8], order: Order) -> Image.Image:
-    with optional_import():
-        from PIL import Image
-
-    size = (image.shape[1], image.shape[0])
-    if image.ndim == 2:
-        return Image.frombuffer("L", size, image, "raw", "L", 0, 1)
-    if image.shape[2] == 3:
-        return Image.frombuffer("RGB", size, image, "raw", order.upper(), 0, 1)
-    return Image.frombuffer("RGBA", size, image, "raw", f"{order.upper()}A", 0, 1)
+    mode = "L" if image.ndim == 2 else "RGB" if image.shape[2] == 3 else "RGBA"
+    raw = "L" if mode == "L" else f"{order.upper()}{mode[3:]}"
+    picture: Image.Image = pillow().frombuffer(mode, image.shape[1::-1], image, "raw", raw, 0, 1)
+    return picture
 
 
 def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
     if max_side_px is None or max(picture.size) <= max_side_px:
         return picture
-    with optional_import():
-        from PIL import Image
-
     scale = max_side_px / max(picture.size)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
-    return picture.resize(size, Image.Resampling.BOX)
+    return picture.resize(size, pillow().Resampling.BOX)
 
 
 def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     """Shrink to twice the size by maximum, and from there by mean: thin lines stay, and stay thinner than areas."""
-    with optional_import():
-        from PIL import Image
-
     doubled = _mask_picture(mask, 2 * max_side_px).convert("L")
     indices = _resized(doubled, max_side_px).point(_BRIGHTER)
-    picture = Image.frombytes("P", indices.size, indices.tobytes())
+    picture: Image.Image = pillow().frombytes("P", indices.size, indices.tobytes())
     picture.putpalette([level * 255 // (_GREYS - 1) for level in range(_GREYS) for _ in "rgb"])
     return picture
 
@@ -284,10 +277,8 @@ def _is_thumbnail(image: Array, max_side_px: int | None) -> bool:
 
 
 def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
-    with optional_import():
-        from PIL import Image
-
-    return Image.fromarray(_mask_bits(mask, max_side_px)).convert("1")
+    picture: Image.Image = pillow().fromarray(_mask_bits(mask, max_side_px))
+    return picture.convert("1")
 
 
 def _mask_bits(mask: Array, max_side_px: int | None) -> npt.NDArray[np.bool_]:

@@ -72,10 +72,11 @@ class ValuePreview:
 
     def finished(self, value: Any, look: Look, most_bytes: int) -> Preview:
         """Return the preview with a thumbnail of at most so many bytes."""
-        if self._made is None or self._made[1] != most_bytes:
+        made = self._made
+        if made is None or made[1] != most_bytes:
             sketch = self._sketch or sketch_in_context(value, look, False)
-            self._made = finished_in_context(sketch, most_bytes), most_bytes
-        return self._made[0]
+            self._made = made = finished_in_context(sketch, most_bytes), most_bytes
+        return made[0]
 
     def release(self) -> None:
         """Forget what refers to the value's memory."""

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from epypes.display.previews import arrays, objects
 from epypes.display.previews.drawing import MOST_LINES, MOST_POINTS
-from epypes.display.previews.encoding import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture, encode_small
+from epypes.display.previews.encoding import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture, encode_small, pillow
 from epypes.display.previews.images import is_image
 from epypes.display.previews.introspection import kind_name, looking, plain_text
 from epypes.display.previews.model import Chart, Look, Preview, Scene, Sketch
@@ -19,7 +19,6 @@ from epypes.display.previews.registry import looker_of
 from epypes.display.previews.short import reason
 from epypes.display.text import cut
 from epypes.images import Order
-from epypes.optional import optional_import
 
 _TEXT_CHARACTERS: Final = 30
 _DETAIL_CHARACTERS: Final = 290
@@ -137,8 +136,9 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
 def _trimmed(shown: Preview) -> Preview:
     """Return a preview whose texts are plain texts, on one line, and within the limits."""
     rows = tuple(itertools.islice(shown.rows, _MOST_ROWS))
-    if not all(issubclass(type(line), str) for line in (shown.text, shown.detail, *rows)):
-        raise TypeError("text, detail and rows of a preview must be texts")
+    for line in (shown.text, shown.detail, *rows):
+        if not issubclass(type(line), str):
+            raise TypeError("text, detail and rows of a preview must be texts")
     text = cut(plain_text(shown.text)[:500], _TEXT_CHARACTERS)
     detail = cut(plain_text(shown.detail)[:1000], _DETAIL_CHARACTERS)
     return Preview(text or "(empty text)", detail, shown.picture, shown.chart, tuple(map(_on_one_line, rows)))
@@ -175,10 +175,7 @@ def _checked_chart(chart: Any) -> Chart:
 
 def _checked_picture(picture: Picture, most_bytes: int) -> Picture:
     """Return a picture within the limits of a thumbnail; what it is, its bytes decide."""
-    with optional_import():
-        from PIL import Image
-
-    with Image.open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
+    with pillow().open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
         if opened.width * opened.height > _MOST_PIXELS:
             raise ValueError(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
         # What is broken is found by decoding it.

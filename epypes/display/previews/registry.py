@@ -39,7 +39,8 @@ class _Registry:
 
     def get(self, kind: type) -> Looker | None:
         """Return the function of this very class."""
-        return self._by_class.get(kind) or self._by_name.get(dotted_name(kind))
+        found = self._by_class.get(kind)
+        return found if found or not self._by_name else self._by_name.get(dotted_name(kind))
 
 
 _ours: Final = _Registry()

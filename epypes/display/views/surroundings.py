@@ -37,9 +37,7 @@ class RunSurroundings:
     """
 
     def __init__(self, run: Run, token: str, range_of: Callable[[str, Any], Range] | None = None) -> None:
-        self._run, self._token = run, token
-        self._range_of = partial(kept_range, run.tokens.program) if range_of is None else range_of
-        self._digraph = run.cg.digraph
+        self._run, self._token, self._range_of = run, token, range_of
 
     def nearest_image(self) -> Backdrop | None:
         """Return the nearest image among the token's ancestors; of its size rather a photograph than a mask."""
@@ -89,13 +87,15 @@ class RunSurroundings:
     def _around(self, token: str) -> Iterator[str]:
         """Yield a token, what its function made beside it, and their ancestors."""
         yield token
-        maker = self._digraph.producer.get(token)
+        maker = self._run.cg.digraph.producer.get(token)
         if maker is not None:
-            yield from (name for name in self._digraph.outputs[maker] if name != token and self._is_fresh(name))
+            yield from (name for name in self._run.cg.digraph.outputs[maker] if name != token and self._is_fresh(name))
         for name in self._ancestors(token):
             yield name
-            maker = self._digraph.producer.get(name)
-            yield from () if maker is None else (near for near in self._digraph.outputs[maker] if self._is_fresh(near))
+            maker = self._run.cg.digraph.producer.get(name)
+            yield from (
+                () if maker is None else (near for near in self._run.cg.digraph.outputs[maker] if self._is_fresh(near))
+            )
 
     def _ancestors(self, token: str) -> Iterator[str]:
         """Yield the tokens that a token was made from that have a value, the nearest first."""
@@ -108,8 +108,8 @@ class RunSurroundings:
                     yield name
 
     def _inputs(self, token: str) -> tuple[str, ...]:
-        maker = self._digraph.producer.get(token)
-        return tuple(self._digraph.inputs[maker]) if maker is not None else ()
+        maker = self._run.cg.digraph.producer.get(token)
+        return tuple(self._run.cg.digraph.inputs[maker]) if maker is not None else ()
 
     def _is_fresh(self, token: str) -> bool:
         return self._run.tokens.is_computed(token) and not self._run.tokens.is_stale(token)
@@ -127,7 +127,8 @@ class RunSurroundings:
 
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
-        return Backdrop(value, colour_order(self._run.cg, token), self._range_of(token, value), token)
+        range_of = self._range_of or partial(kept_range, self._run.tokens.program)
+        return Backdrop(value, colour_order(self._run.cg, token), range_of(token, value), token)
 
 
 def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:

@@ -10,7 +10,6 @@ from epypes.display.previews.encoding import THUMBNAIL_BYTES
 from epypes.display.previews.introspection import looking
 from epypes.display.previews.kept import ValuePreview, kept_previews, kept_range
 from epypes.display.previews.model import Look, Preview
-from epypes.display.previews.preview import preview
 from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.views.graphview import GraphView, TokenState, TokenView
 from epypes.display.views.surroundings import RunSurroundings
@@ -29,6 +28,21 @@ class _Found(NamedTuple):
     shown: ValuePreview
     value: Any
     look: Look
+
+
+class _Known(NamedTuple):
+    """The previews that are kept of a program's tokens; in a nested look, each value is named only."""
+
+    kept: dict[str, ValuePreview]
+    is_nested: bool
+
+    def find(self, name: str, value: Any, look: Look) -> _Found:
+        shown = self.kept.get(name)
+        if shown is None or self.is_nested or not shown.is_of(value, look):
+            shown = ValuePreview(value, look, self.is_nested)
+            if shown.is_constant:
+                self.kept[name] = shown
+        return _Found(shown, value, look)
 
 
 class Room(NamedTuple):
@@ -57,13 +71,15 @@ def token_views(
 ) -> tuple[TokenView, ...]:
     """Look at tokens of which only hyperparameters have a value; those of ``targets`` get a thumbnail before others."""
     with looking() as is_nested:
-        found: dict[str, _Found] = {}
-        for token in structure.tokens:
-            if token.name in hparams.values:
-                value, look = hparams.values[token.name], Look(token.order)
-                found[token.name] = _Found(ValuePreview(value, look, is_nested), value, look)
+        known = _Known({}, is_nested)
+        found = {
+            token.name: known.find(token.name, hparams.values[token.name], Look(token.order))
+            for token in structure.tokens
+            if token.name in hparams.values
+        }
         previews, _ = _with_thumbnails(found, lambda name: name not in targets, room)
-    return _views(structure, hparams, state_of, previews)
+        first = _first_texts(structure, hparams, known)
+    return _views(structure, hparams, state_of, previews, first)
 
 
 def run_token_views(
@@ -92,31 +108,26 @@ def run_token_views(
         The tokens, and how many thumbnails were left out.
     """
     values, program, producer = run.tokens.values, run.tokens.program, run.cg.digraph.producer
-    known = {name: value for name, value in zip(program.tokens, values, strict=True) if value is not NOT_COMPUTED}
-    kept, found = kept_previews(program), {}
+    computed = {name: value for name, value in zip(program.tokens, values, strict=True) if value is not NOT_COMPUTED}
+    shown = {**computed, **hparams.values}
     with looking() as is_nested:
+        known = _Known(kept_previews(program), is_nested)
+        found = {}
         for token in structure.tokens:
-            name = token.name
-            if name not in hparams.values and name not in known:
-                continue
-            value = hparams.values[name] if name in hparams.values else known[name]
-            look = Look(token.order, partial(kept_range, program, name), RunSurroundings(run, name))
-            shown = kept.get(name)
-            if shown is None or not shown.is_of(value, look):
-                shown = ValuePreview(value, look, is_nested)
-                if shown.is_constant:
-                    kept[name] = shown
-            found[name] = _Found(shown, value, look)
+            if (name := token.name) in shown:
+                look = Look(token.order, partial(kept_range, program, name), RunSurroundings(run, name))
+                found[name] = known.find(name, shown[name], look)
         previews, dropped = _with_thumbnails(found, _rank(run, found, seen), room)
+        first = _first_texts(structure, hparams, known)
     for each in found.values():
         each.shown.release()
 
     def state_of(token: str) -> TokenState:
-        if token not in known:
+        if token not in computed:
             return "not computed"
         return "stale" if producer.get(token) in stale else "fresh"
 
-    return _views(structure, hparams, state_of, previews), dropped
+    return _views(structure, hparams, state_of, previews, first), dropped
 
 
 def _rank(run: Run, found: Mapping[str, _Found], seen: Collection[str]) -> Rank:
@@ -134,25 +145,32 @@ def _rank(run: Run, found: Mapping[str, _Found], seen: Collection[str]) -> Rank:
     return rank
 
 
+def _first_texts(structure: GraphView, hparams: Hyperparameters, known: _Known) -> dict[str, str]:
+    """Return the texts of the first values of hyperparameters that have another one now."""
+    texts = {}
+    for token in structure.tokens:
+        name = token.name
+        if name in hparams.first and name in hparams.values:
+            first, value = hparams.first[name], hparams.values[name]
+            if first is not value and not is_same_value(first, value):
+                texts[name] = known.find(f"first {name}", first, Look(token.order)).shown.brief.text
+    return texts
+
+
 def _views(
     structure: GraphView,
     hparams: Hyperparameters,
     state_of: Callable[[str], TokenState],
     previews: Mapping[str, Preview],
+    first: Mapping[str, str],
 ) -> tuple[TokenView, ...]:
     def view(token: TokenView) -> TokenView:
         name, is_hyperparameter = token.name, token.name in hparams.values
         state = token.state if token.state == "left out" else "fresh" if is_hyperparameter else state_of(name)
         role = "hyperparameter" if is_hyperparameter else token.role
-        first = _first_text(token, hparams) if name in hparams.first and is_hyperparameter else ""
-        return TokenView(name, role, state, previews.get(name), token.order, first)
+        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""))
 
     return tuple(map(view, structure.tokens))
-
-
-def _first_text(token: TokenView, hparams: Hyperparameters) -> str:
-    first, value = hparams.first[token.name], hparams.values[token.name]
-    return "" if first is value or is_same_value(first, value) else preview(first, token.order).text
 
 
 def _with_thumbnails(found: Mapping[str, _Found], rank: Rank, room: Room) -> tuple[dict[str, Preview], int]:
