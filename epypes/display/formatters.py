@@ -23,72 +23,15 @@ from epypes.run import Plan, RunReport, TimingSummary
 from epypes.run.report import Reports
 from epypes.wording import counted
 
+Forms = dict[str, str]
 
-def mimebundle(shown: Any) -> dict[str, str]:
+
+def mimebundle(shown: Any) -> Forms:
     """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of what shows itself.
 
     Never raises: what can't be painted is shown as text, with the reason and the way out.
     """
-    return bundle_of(shown, lambda: _painted(shown), lambda: view(shown))
-
-
-def bundle_of(shown: Any, paint: Callable[[], dict[str, str]], look: Callable[[], GraphView]) -> dict[str, str]:
-    """Return a text and what is painted, or, where that can't be, the text with the reason.
-
-    Parameters
-    ----------
-    shown
-        What the text is of.
-    paint
-        Paints the other forms.
-    look
-        Looks at the graph, which is shown as text where no Graphviz engine answers.
-    """
-    plain = repr_text(shown)
-    try:
-        return {"text/plain": plain, **paint()}
-    except LayoutUnavailable as error:
-        return {"text/plain": f"{plain}\n{paint_text(look())}\n{error}"}
-    except Exception as error:
-        return {"text/plain": f"{plain}\n(no picture: {reason(error)})"}
-
-
-def _painted(shown: Any) -> dict[str, str]:
-    if isinstance(shown, Reports):
-        shown = summary_of(shown)
-    if isinstance(shown, str):
-        return {"text/html": f"<p>{shown}</p>"}
-    if isinstance(shown, RunReport | TimingSummary):
-        return _painted_times(shown)
-    return html_and_svg(view(shown), table_below(shown))
-
-
-def _painted_times(shown: RunReport | TimingSummary) -> dict[str, str]:
-    times = report_times(shown) if isinstance(shown, RunReport) else summary_times(shown)
-    svg, table = paint_bars(times), paint_table(table_of(shown))
-    return {
-        "text/html": paint_page(paint_figure(svg, times_alt_text(times), times.legend), table),
-        "image/svg+xml": svg,
-    }
-
-
-def table_below(shown: Any) -> str:
-    """Return the table below the picture of a plan, with all functions of its groups; nothing for anything else."""
-    if not isinstance(shown, Plan):
-        return ""
-    return paint_table(table_of(shown)._replace(caption=""))
-
-
-def html_and_svg(graph: GraphView, below: str = "") -> dict[str, str]:
-    """Return a picture for a page, with what is ``below`` it, and as the text of an SVG file.
-
-    Raises
-    ------
-    LayoutUnavailable
-        No Graphviz engine answered.
-    """
-    svg = paint_svg(graph)
-    return {"text/html": paint_page(*paint_graph(graph, svg, size(below)), below), "image/svg+xml": svg}
+    return _bundle(shown, lambda: _forms(shown), lambda: view(shown))
 
 
 def to_svg(shown: Shown) -> str:
@@ -108,6 +51,40 @@ def to_text(shown: Tabular) -> str:
         return text_table(table_of(shown))
     except Exception as error:
         return f"{repr_text(shown)}\n(no table: {reason(error)})"
+
+
+def _bundle(shown: Any, paint: Callable[[], Forms], look: Callable[[], GraphView]) -> Forms:
+    """Return a text and what is painted; where no Graphviz engine answers, the graph as text with the reason."""
+    plain = repr_text(shown)
+    try:
+        return {"text/plain": plain, **paint()}
+    except LayoutUnavailable as error:
+        return {"text/plain": f"{plain}\n{paint_text(look())}\n{error}"}
+    except Exception as error:
+        return {"text/plain": f"{plain}\n(no picture: {reason(error)})"}
+
+
+def _forms(shown: Any) -> Forms:
+    if isinstance(shown, Reports):
+        shown = summary_of(shown)
+    if isinstance(shown, str):
+        return {"text/html": f"<p>{shown}</p>"}
+    if not isinstance(shown, RunReport | TimingSummary):
+        return _graph_forms(view(shown), _table_below(shown))
+    times = report_times(shown) if isinstance(shown, RunReport) else summary_times(shown)
+    svg = paint_bars(times)
+    figure = paint_figure(svg, times_alt_text(times), times.legend)
+    return {"text/html": paint_page(figure, paint_table(table_of(shown))), "image/svg+xml": svg}
+
+
+def _graph_forms(graph: GraphView, below: str) -> Forms:
+    svg = paint_svg(graph)
+    return {"text/html": paint_page(*paint_graph(graph, svg, size(below)), below), "image/svg+xml": svg}
+
+
+def _table_below(shown: Any) -> str:
+    """Return the table below the picture of a plan, with all functions of its groups; nothing for anything else."""
+    return paint_table(table_of(shown)._replace(caption="")) if isinstance(shown, Plan) else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +110,7 @@ class Figure:
     @property
     def html(self) -> str:
         """The picture for a page, with its caption and the insides of its groups."""
-        return html_and_svg(self.view, self.table)["text/html"]
+        return _graph_forms(self.view, self.table)["text/html"]
 
     def save(self, path: str | Path) -> Path:
         """Write the picture as ``.svg``, as a page of its own as ``.html``, or what is to be seen as ``.json``.
@@ -147,7 +124,9 @@ class Figure:
         if path.suffix == ".svg":
             text = self.svg
         elif path.suffix == ".html":
-            text = _page(self.html, alt_text(self.view))
+            style = "body{margin:16px;font-family:system-ui,sans-serif}table{border-spacing:12px 2px}"
+            head = f'<meta charset="utf-8"><title>{escape(alt_text(self.view))}</title><style>{style}</style>'
+            text = f'<!doctype html><html lang="en"><head>{head}</head><body>{self.html}</body></html>\n'
         elif path.suffix == ".json":
             text = json.dumps(to_json(self.view))
         else:
@@ -160,8 +139,8 @@ class Figure:
         groups = f", {counted(len(self.view.groups), 'closed group')}" * bool(self.view.groups)
         return f"<Figure: {counted(function_count(self.view), 'function')}{groups}; {self.view.direction}>"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return bundle_of(self, lambda: html_and_svg(self.view, self.table), lambda: self.view)
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> Forms:
+        return _bundle(self, lambda: _graph_forms(self.view, self.table), lambda: self.view)
 
 
 def show(
@@ -207,10 +186,4 @@ def show(
     <Figure: 1 function; right>
     """
     graph = view(shown, direction=direction, thumbnails=thumbnails, open=open, collapse=collapse)
-    return Figure(graph, table_below(shown))
-
-
-def _page(html: str, title: str) -> str:
-    style = "body{margin:16px;font-family:system-ui,sans-serif}table{border-spacing:12px 2px}"
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{style}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{html}</body></html>\n'
+    return Figure(graph, _table_below(shown))
