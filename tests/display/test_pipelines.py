@@ -300,7 +300,7 @@ def test_a_pipeline_of_ones_own_may_add_stages():
 
 def test_a_pipeline_that_can_not_tell_its_stages_is_shown_without():
     shown = mimebundle(Broken("broken", graph(), queue.Queue(), queue.Queue(), f_in, f_out))
-    assert "its stages can't be told: RuntimeError: not today" in unescape(shown["text/html"])
+    assert "its stages can't be read: RuntimeError: not today" in unescape(shown["text/html"])
     assert "function-f" in vertices(shown["image/svg+xml"])
 
 

@@ -1,4 +1,4 @@
-"""How is Graphviz asked where vertices and edges go?
+"""Layouts by Graphviz.
 
 The graphviz package writes the DOT source, which holds sizes and edges but no names and no values. pygraphviz has
 Graphviz inside its wheel; where it is missing, ``dot`` on the PATH serves.

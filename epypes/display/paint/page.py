@@ -85,7 +85,7 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     """Return the picture of a graph as a figure, and what is inside each of its groups, to be opened below it.
 
     Each figure has a table twin and what the script needs to know. Rows of the twins, sources of functions and the
-    insides of groups are left out where they don't fit, and what was left out is said.
+    insides of groups are left out where they don't fit, and what was left out is stated.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""How are the edges of a graph painted as SVG?"""
+"""A graph as SVG.
+
+Graphviz gives the geometry only; every mark is painted here, so that names, values, thumbnails and states change
+without a new layout, and colours follow the page's theme.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +54,7 @@ def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
     """Paint edges as one path of curves and one of their tips; each edge is a piece of both that begins with M."""
     curves, tips = [], []
     for *spline, tip in splines:
-        # What edges share is not told apart where each is painted whole.
+        # What edges share looks like one line where each is painted whole.
         curves.append(_curves(spline if kind == _OFF else _without_stops(spline)))
         tips.append(f"M{_arrow(spline[-1], tip)}Z")
     if kind == _OFF:
@@ -95,7 +99,7 @@ def _each_once(splines: Iterable[list[tuple[str, str]]]) -> list[list[tuple[str,
 
 
 def _path(curves: list[tuple[str, str]]) -> str:
-    """Return curves as part of a path; where one starts at the end of the last one, that is not said again."""
+    """Return curves as part of a path; where one starts at the end of the last one, that is not repeated."""
     path, at = "", ""
     for start, controls in curves:
         path += f" {controls}" if start == at else f"M{start}C{controls}"
@@ -180,10 +184,10 @@ def alt_text(graph: GraphView) -> str:
     order = ", ".join(short_name(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
     functions = counted(function_count(graph), "function")
-    said = f"Computational graph of {functions}: {order}{more}. {fitted(graph.caption, _CAPTION_ROOM)}".strip()
+    text = f"Computational graph of {functions}: {order}{more}. {fitted(graph.caption, _CAPTION_ROOM)}".strip()
     if not graph.title:
-        return said
+        return text
     stages = [short_name(stage.name) for stage in graph.before] + ["the graph"] * bool(graph.before or graph.after)
     stages += [short_name(stage.name) for stage in graph.after]
     through = f", events go through {', '.join(stages)}" if stages else ""
-    return f"Pipeline {short_name(graph.title)}{through}. {said}"
+    return f"Pipeline {short_name(graph.title)}{through}. {text}"

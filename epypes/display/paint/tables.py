@@ -184,7 +184,7 @@ def paint_twin(graph: GraphView, title: str, room: int) -> str:
     """Paint a graph as tables for screen readers; they also stay where a page strips the picture.
 
     First the functions, with the stages around them, then the tokens, so many of them as fit in ``room`` characters;
-    how many don't is said.
+    how many don't is stated.
     """
     functions = [
         _function_row(function, ", ".join(inputs), ", ".join(outputs))

@@ -1,4 +1,4 @@
-"""What is shown of an array?"""
+"""Previews of arrays and of numbers of numpy."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ from epypes.display.previews.short import array_text, float_text, row_texts, sho
 from epypes.display.text import cut
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
+    from epypes.display.previews.model import Array
 
-    Array = npt.NDArray[Any]
 
 _MOST_ELONGATED: Final = 6
 _SMALL_SIDE: Final = 4
@@ -70,8 +69,8 @@ def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     if closer is None:
         return _plain(array)
     text = array_text(array) + _order_text(array, look) * (closer is image_sketch)
-    said = f"{text}, {statistics_text(few_of(array), array)}"
-    brief = Preview(text, said, rows=_rows(array) if array.ndim > 1 else ())
+    detail = f"{text}, {statistics_text(few_of(array), array)}"
+    brief = Preview(text, detail, rows=_rows(array) if array.ndim > 1 else ())
     return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
 
 
@@ -97,16 +96,16 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     kind = image_kind(array, sample)
     ends = look.range_of(array)
     text = array_text(array) + _order_text(array, look)
-    said, note = [text, statistics_text(sample, array)], ""
+    detail, note = [text, statistics_text(sample, array)], ""
     if kind == "labels":
-        said.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
+        detail.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
     elif kind == "mask":
-        said.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
+        detail.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
     elif not is_of_dtype(array.dtype, ends):
         note = f"shown from {ends[0]:.6g} to {ends[1]:.6g}"
-        said.append(note)
+        detail.append(note)
     return Sketch(
-        Preview(text, ", ".join(said)),
+        Preview(text, ", ".join(detail)),
         lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
         is_image=True,
         scene=lambda: Scene(Backdrop(array, look.order, ends, "")),
@@ -134,8 +133,8 @@ def _drawn_numbers(array: Array, look: Look) -> Sketch:
     text = array_text(array)
     is_histogram = _are_counts(array)
     name = "histogram" if is_histogram else "signal"
-    said = f"{text} {name}, {statistics_text(some_of(array), array)}"
-    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(array) if is_histogram else line_chart(array))
+    detail = f"{text} {name}, {statistics_text(some_of(array), array)}"
+    return Sketch(Preview(text, detail), lambda most_bytes: bar_chart(array) if is_histogram else line_chart(array))
 
 
 def _are_counts(array: Array) -> bool:

@@ -1,4 +1,7 @@
-"""How do numbers become lines, bars and points between 0 and 1?"""
+"""Charts of numbers, and marks drawn over the image that they were found in.
+
+Without an image at hand marks become a chart in their own extent.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,9 @@ from epypes.optional import optional_import
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
-
-    Floats = npt.NDArray[np.float64]
     from PIL import Image
+
+    from epypes.display.previews.model import Floats
 
 MOST_POINTS: Final = 128
 MOST_LINES: Final = MOST_POINTS // 4

@@ -1,4 +1,4 @@
-"""Is an array an image, and is it to be seen as a mask, as labels or as a photograph?
+"""What an image is: a mask, labels or a photograph; its display range, and its statistics in a line.
 
 What is decided from the values of a large image is decided from a strided sample.
 """
@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.display.previews.introspection import is_of
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
+    from epypes.display.previews.model import Array
 
-    Array = npt.NDArray[Any]
 
 ImageKind = Literal["mask", "labels", "photograph"]
 
@@ -75,7 +74,7 @@ def is_mask(image: Array) -> bool:
     """Whether an image of one channel has two values only: bool, or uint8 of 0 and 255, or of 0 and 1."""
     if image.ndim != 2 or image.dtype.kind not in "bu" or image.dtype.itemsize > 1:
         return False
-    # A few pixels of a photograph tell already that it is none.
+    # A few pixels of a photograph show already that it is none.
     return image.dtype.kind == "b" or (_has_two_values(image[::16, ::16]) and _has_two_values(image))
 
 
@@ -166,21 +165,21 @@ def display_range(image: Array) -> Range:
 
 
 def sole_value(image: Array) -> Any:
-    """Return the value of an image that has but one and whose dtype does not tell how bright that is; None if not so.
+    """Return the value of an image that has but one and whose dtype does not show how bright that is; None if not so.
 
     Its own range would make it black, whatever it is.
     """
     if image.dtype.kind == "b" or (image.dtype.itemsize <= 2 and image.dtype.kind == "u"):
         return None
     first = image.flat[0]
-    # A few pixels of most images tell already that there are more values.
+    # A few pixels of most images show already that there are more values.
     if not all(((part == first) | ((part != part) & (first != first))).all() for part in (image[::16, ::16], image)):
         return None
     return None if image.dtype.kind == "f" and 0.0 <= first <= 1.0 else first.item()
 
 
 def is_of_dtype(dtype: Any, ends: Range) -> bool:
-    """Whether a range is what everybody expects of a dtype: nothing has to be said of it then."""
+    """Whether a range is the usual one of a dtype, which need not be stated."""
     expected = {"b": _UNIT, "f": _UNIT, "u": (0.0, 2.0 ** (8 * dtype.itemsize) - 1)}.get(dtype.kind)
     return ends == expected
 

@@ -1,4 +1,4 @@
-"""Of which kind is a value, found without running a line of its class?
+"""Safe introspection: the kind and the parts of a value, without running a line of its class.
 
 A class may say of itself what it likes, and compute or raise when it is asked. So Python's own slots are read, and
 what is known of a value is only what its classes are, by identity.
@@ -77,7 +77,7 @@ def stored(value: Any, name: str) -> tuple[Any, ...]:
 
 
 def is_of(value: Any, package: str, *names: str) -> bool:
-    """Whether a value is of one of these classes of a package, that somebody else has imported by now."""
+    """Whether a value is of one of these classes of a package, if that is imported by now."""
     module = sys.modules.get(package)
     if module is None:
         return False
@@ -173,7 +173,7 @@ def _is_written_by_fields(kind: type) -> bool:
     """Whether a class has the repr that ``dataclass`` makes: one of its author's own may be to hide something."""
     if type(declared(kind, "__dataclass_fields__")) is not dict:
         return False
-    # The function that dataclass makes is told from others as pprint does.
+    # The function that dataclass makes is recognized as pprint does it.
     made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
     return type(made) is FunctionType and "__create_fn__" in made.__qualname__
 

@@ -20,9 +20,8 @@ from epypes.run import CompGraphRunner, Run
 from epypes.run.program import Program
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
+    from epypes.display.previews.model import Array
 
-    Array = npt.NDArray[Any]
 
 _SCALARS: Final = frozenset({int, float, complex, bool, type(None)})
 _SHORT_TEXT: Final = 200
@@ -40,7 +39,7 @@ class ValuePreview:
     is_image
         Whether the value is an image.
     is_constant
-        Whether nobody can change the value, and the preview is made of nothing else: such a preview may be kept. A
+        Whether the value can't be changed, and the preview is made of nothing else: such a preview may be kept. A
         payload is not constant, since its owner may fill it again.
     """
 
@@ -119,7 +118,7 @@ def kept_previews(program: Program) -> dict[str, ValuePreview]:
 def kept_range(program: Program, token: str, image: Array) -> Range:
     """Return the values that are shown black and white in a token's images: what its first one had.
 
-    Of an image of one value nothing is kept, since it does not tell what is to come.
+    Of an image of one value nothing is kept, since it does not show what is to come.
     """
     if image.dtype.kind == "b" or image.dtype.str[1:] == "u1":
         return display_range(image)

@@ -1,4 +1,4 @@
-"""What is shown of a table?"""
+"""Previews of plain values, containers, records and tables."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def _series(series: Any, look: Look) -> Preview:
     rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
     name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
     more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
-    said = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
-    return Preview(f"Series, {counted(len(series), 'row')}", said, rows=(*rows, *more))
+    detail = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
+    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=(*rows, *more))
 
 
 def record_sketch(array: Any) -> Preview:
@@ -53,7 +53,7 @@ def record_sketch(array: Any) -> Preview:
 
 
 def is_dict_list(value: Sequence[Any]) -> bool:
-    """Whether a list is a table: a few dicts of the same texts as keys, as far as its first items tell."""
+    """Whether a list is a table: a few dicts of the same texts as keys, as far as its first items show."""
     first = value[0] if len(value) else None
     if type(first) is not dict or not first or not all(type(key) is str for key in first):
         return False
@@ -67,11 +67,11 @@ def dict_list_sketch(value: Sequence[dict[str, Any]]) -> Preview:
     return _table(len(value), len(names), names, rows, f"list of {len(value)} dicts: {', '.join(names[:_NAMED])}")
 
 
-def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], said: str) -> Preview:
+def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], detail: str) -> Preview:
     text = f"{counted(count, 'row')} x {columns} columns"
     more = ", ..." if columns > _NAMED else ""
     kept = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
-    return Preview(text, cut(f"{said}{more}; {text}", 280), rows=tuple(map(_line, _padded(kept))))
+    return Preview(text, cut(f"{detail}{more}; {text}", 280), rows=tuple(map(_line, _padded(kept))))
 
 
 def _padded(lines: list[list[str]]) -> list[list[str]]:
@@ -138,7 +138,7 @@ def _path(value: Any, look: Look) -> Preview:
 
 @ours(list)
 def _list(value: Sequence[Any], look: Look) -> Sketch | Preview:
-    # A subclass may have ways of its own to reach its items, which are nobody else's.
+    # A subclass may have ways of its own to reach its items, which are not used.
     plain = value if type(value) is list else list(items_in(value))
     if is_dict_list(plain):
         return dict_list_sketch(plain)
@@ -175,8 +175,8 @@ def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
     """Look at counts and edges as ``np.histogram`` returns them."""
     counts, edges = value
     text = f"{len(counts)} bins"
-    said = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
-    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(counts))
+    detail = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
+    return Sketch(Preview(text, detail), lambda most_bytes: bar_chart(counts))
 
 
 def is_histogram(value: Any) -> bool:
@@ -198,8 +198,8 @@ def _object(value: Any, look: Look) -> Preview:
 
 def _fields(value: Any, fields: dict[str, Any]) -> Preview:
     text = _name(value)
-    said = ", ".join(f"{name}: {short_repr(item)}" for name, item in itertools.islice(fields.items(), 8))
-    return Preview(text, cut(f"{text}: {said}", 280), rows=item_texts(fields, len(fields), _MOST_ROWS))
+    detail = ", ".join(f"{name}: {short_repr(item)}" for name, item in itertools.islice(fields.items(), 8))
+    return Preview(text, cut(f"{text}: {detail}", 280), rows=item_texts(fields, len(fields), _MOST_ROWS))
 
 
 def _items(value: Any) -> Preview:

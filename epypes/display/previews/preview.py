@@ -90,7 +90,7 @@ def scene_in(sketched: Sketch) -> Scene | None:
         try:
             found = sketched if sketched.closer is None else sketched.closer()
             return found.scene() if isinstance(found, Sketch) and found.scene is not None else None
-        except Exception:  # what is wrong is said where the value is shown as text
+        except Exception:  # the reason stands where the value is shown as text
             return None
 
 

@@ -1,4 +1,4 @@
-"""How is any value written in a few characters?"""
+"""Any value in a few characters."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class ShortRepr(reprlib.Repr):
             return kind_name(kind)
         length = length_of(x)
         # What is so long would take its own repr as long.
-        return f"{kind_name(kind)} of {length}" if length > _LONGEST else said_by(repr, x)
+        return f"{kind_name(kind)} of {length}" if length > _LONGEST else text_by(repr, x)
 
     def repr_float(self, x: float, level: int) -> str:
         """Write a float that is inside of something: to six digits."""
@@ -129,8 +129,8 @@ def shown_items(value: Any) -> Iterator[Any]:
     return iter(sorted_items(value, short_repr)) if issubclass(type(value), set | frozenset) else items_in(value)
 
 
-def said_by(write: Any, value: Any) -> str:
-    """Return what an author's ``repr`` or ``str`` says of a value, without addresses in memory."""
+def text_by(write: Any, value: Any) -> str:
+    """Return an author's ``repr`` or ``str`` of a value, without addresses in memory."""
     return without_addresses(plain_text(write(value))[: 2 * _LONGEST])
 
 
@@ -140,26 +140,26 @@ def without_addresses(text: str) -> str:
 
 
 def _message(error: BaseException) -> str:
-    """Return what an exception says; one that says no text but a value, as that value is written."""
+    """Return the message of an exception; one whose message is a value, as that value is written."""
     arguments = _arguments_of(error)
     is_value = len(arguments) == 1 and not issubclass(type(arguments[0]), str)
     if is_value and declared(type(error), "__str__") is BaseException.__str__:
         return short_repr(arguments[0])
-    return said_by(str, error)
+    return text_by(str, error)
 
 
 def reason(error: BaseException, characters: int = 60) -> str:
     """Return what was raised, ``"ValueError: no image"``, cut."""
     kind = kind_name(type(error))
     try:
-        said = _message(error)
+        message = _message(error)
     except Exception:  # an exception's __str__ is its author's
-        said = ""
-    return cut(f"{kind}: {said}" if said else kind, characters)
+        message = ""
+    return cut(f"{kind}: {message}" if message else kind, characters)
 
 
 def float_text(value: float, digits: int = 6) -> str:
-    """Return a float to so many digits; one without fraction with ``.0``, so that it can be told from an int."""
+    """Return a float to so many digits; one without fraction with ``.0``, unlike an int."""
     text = f"{float(value):.{digits}g}"
     return text + ".0" * text.lstrip("-").isdigit()
 

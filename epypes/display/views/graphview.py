@@ -147,7 +147,7 @@ class GraphView:
 
     @property
     def draws_edges(self) -> bool:
-        """Whether its edges can be seen; of too many, nobody sees one."""
+        """Whether its edges can be seen: there are not too many."""
         return len(self.edges) <= _MOST_EDGES * (len(self.functions) + len(self.tokens))
 
     def io(self) -> list[tuple[list[str], list[str]]]:

@@ -1,6 +1,6 @@
-"""Over which images of a run can what was found in them be drawn?
+"""The images of a run that what was found in them is drawn over, and scenes at full size.
 
-The graph tells: a token is made from the tokens that its function takes, those from others, and so on.
+The graph shows them: a token is made from the tokens that its function takes, those from others, and so on.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.features import are_keypoints
 from epypes.display.previews.images import Range, image_kind, is_image, sampled
 from epypes.display.previews.kept import kept_range
-from epypes.display.previews.model import Backdrop, Look, Marks, Most, Scene
+from epypes.display.previews.model import Backdrop, Look, Marks, Most, Scene, Surroundings
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
 from epypes.run import Run
@@ -23,7 +23,7 @@ from epypes.run import Run
 _MOST_TOKENS: Final = 500
 
 
-class RunSurroundings:
+class RunSurroundings(Surroundings):
     """The images and keypoints that a token of a run was made from.
 
     Parameters

@@ -290,7 +290,7 @@ def _in_pipeline(graph: GraphView, pipeline: PipelineLike) -> GraphView:
         stages = pipeline.stages
         before, after = _stage_views(stages.before), _stage_views(stages.after)
     except Exception as error:
-        caption = f"its stages can't be told: {reason(error, _NOTE_CHARACTERS)}"
+        caption = f"its stages can't be read: {reason(error, _NOTE_CHARACTERS)}"
         return replace(graph, title=title, caption=". ".join(filter(None, (graph.caption, caption))))
     return replace(graph, title=title, before=before, after=after)
 
