@@ -156,7 +156,9 @@ def _rows(array: Array) -> tuple[str, ...]:
         return ()
     if array.ndim == 1:
         return (
-            row_texts(array, len(array), _MOST_ROWS) if array.dtype.kind not in "biuf" else (" ".join(_cells(array)),)
+            row_texts(map(short_repr, array), len(array), _MOST_ROWS)
+            if array.dtype.kind not in "biuf"
+            else (" ".join(_cells(array)),)
         )
     kept = len(array) if len(array) <= _MOST_ROWS else _MOST_ROWS - 1
     cells = [_cells(row) for row in array[:kept]]

@@ -6,7 +6,6 @@ What is decided from the values of a large image is decided from a strided sampl
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.display.previews.introspection import is_of
@@ -106,47 +105,28 @@ def _has_few_values(sample: Array, largest: int) -> bool:
     return largest <= _MOST_DISTINCT or len(np.unique(sample)) <= _MOST_DISTINCT
 
 
-@dataclass(frozen=True, slots=True)
-class _Neighbours:
-    """How many pairs of pixels there are: touching an object, within objects, equal within them, differing, by one."""
-
-    touching: int
-    within: int
-    equal: int
-    by_one: int
-
-    @property
-    def differing(self) -> int:
-        return self.touching - self.equal
-
-
 def _has_pieces(image: Array, largest: int) -> bool:
     """Whether most neighbours are equal, of those that are not background."""
-    pairs = _neighbours(image)
-    least_equal = _EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS
-    if image.dtype.itemsize >= _WIDE_BYTES:
-        return pairs.equal > 0 and (
-            pairs.equal >= least_equal * pairs.within and pairs.equal >= _EQUAL_OF_SMALL * pairs.touching
-        )
-    # In a dark and blurred photograph most are equal, too, but there they differ by one where they differ.
-    is_smooth = largest > _FEW_LABELS and pairs.by_one > _SMALL_STEPS * pairs.differing
-    return pairs.differing > 0 and not is_smooth and pairs.equal >= least_equal * pairs.touching
-
-
-def _neighbours(image: Array) -> _Neighbours:
     import numpy as np
 
     stride = math.ceil(math.sqrt(image.size / _PAIRS_PX))
     at, right, below = image[:-1:stride, :-1:stride], image[:-1:stride, 1::stride], image[1::stride, :-1:stride]
+    # Pairs of neighbours: that touch an object, within objects, equal ones of these, and those that differ by one.
     touching = within = equal = by_one = 0
-    for side in (right, below):
-        ours, theirs = at, side[: at.shape[0], : at.shape[1]]
-        is_touching = (ours != 0) | (theirs != 0)
+    for near in (right, below):
+        near = near[: at.shape[0], : at.shape[1]]
+        is_touching = (at != 0) | (near != 0)
         touching += int(np.count_nonzero(is_touching))
-        within += int(np.count_nonzero((ours != 0) & (theirs != 0)))
-        equal += int(np.count_nonzero(is_touching & (ours == theirs)))
-        by_one += int(np.count_nonzero(np.maximum(ours, theirs) - np.minimum(ours, theirs) == 1))
-    return _Neighbours(touching, within, equal, by_one)
+        within += int(np.count_nonzero((at != 0) & (near != 0)))
+        equal += int(np.count_nonzero(is_touching & (at == near)))
+        by_one += int(np.count_nonzero(np.maximum(at, near) - np.minimum(at, near) == 1))
+    least_equal = _EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS
+    if image.dtype.itemsize >= _WIDE_BYTES:
+        return equal > 0 and equal >= least_equal * within and equal >= _EQUAL_OF_SMALL * touching
+    # In a dark and blurred photograph most are equal, too, but there they differ by one where they differ.
+    differing = touching - equal
+    is_smooth = largest > _FEW_LABELS and by_one > _SMALL_STEPS * differing
+    return differing > 0 and not is_smooth and equal >= least_equal * touching
 
 
 Range = tuple[float, float]

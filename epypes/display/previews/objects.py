@@ -6,7 +6,7 @@ import enum
 import itertools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from epypes.display.previews.drawing import bar_chart
@@ -15,7 +15,7 @@ from epypes.display.previews.images import memory_text, some_of, statistics_text
 from epypes.display.previews.introspection import fields_of, is_of, items_in, kind_name, length_of, pairs_in, stored
 from epypes.display.previews.model import Look, Preview, Sketch
 from epypes.display.previews.registry import ours
-from epypes.display.previews.short import float_text, item_texts, reason, row_texts, short_repr, shown_items
+from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items
 from epypes.display.text import cut
 from epypes.wording import counted
 
@@ -70,18 +70,10 @@ def dict_list_sketch(value: Sequence[dict[str, Any]]) -> Preview:
 def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], detail: str) -> Preview:
     text = f"{counted(count, 'row')} x {columns} columns"
     more = ", ..." if columns > _NAMED else ""
-    kept = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
-    return Preview(text, cut(f"{detail}{more}; {text}", 280), rows=tuple(map(_line, _padded(kept))))
-
-
-def _padded(lines: list[list[str]]) -> list[list[str]]:
-    """Return cells of the same width in each column."""
+    lines = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
-
-
-def _line(cells: list[str]) -> str:
-    return "  ".join(cells).rstrip()[:_ROW_CHARACTERS]
+    shown = ("  ".join(map(str.ljust, line, widths)).rstrip()[:_ROW_CHARACTERS] for line in lines)
+    return Preview(text, cut(f"{detail}{more}; {text}", 280), rows=tuple(shown))
 
 
 def _cell(value: Any) -> str:
@@ -166,7 +158,7 @@ def _set(value: Any, look: Look) -> Preview:
 @ours(dict, "types.MappingProxyType", "builtins.mappingproxy")
 def _dict(value: Any, look: Look) -> Preview:
     count = length_of(value) or len(value)
-    rows = item_texts(value, count, _MOST_ROWS) or ("(empty)",)
+    rows = row_texts(_item_rows(value), count, _MOST_ROWS) or ("(empty)",)
     keys = ", ".join(short_repr(key) for key, _ in itertools.islice(pairs_in(value), 8))
     return Preview(f"{_name(value)} of {count}", cut(f"{_name(value)} of {count}: {keys}", 200), rows=rows)
 
@@ -199,13 +191,18 @@ def _object(value: Any, look: Look) -> Preview:
 def _fields(value: Any, fields: dict[str, Any]) -> Preview:
     text = _name(value)
     detail = ", ".join(f"{name}: {short_repr(item)}" for name, item in itertools.islice(fields.items(), 8))
-    return Preview(text, cut(f"{text}: {detail}", 280), rows=item_texts(fields, len(fields), _MOST_ROWS))
+    return Preview(text, cut(f"{text}: {detail}", 280), rows=row_texts(_item_rows(fields), len(fields), _MOST_ROWS))
 
 
 def _items(value: Any) -> Preview:
     count = length_of(value)
-    text, rows = f"{_name(value)} of {count}", row_texts(shown_items(value), count, _MOST_ROWS)
+    text, rows = f"{_name(value)} of {count}", row_texts(map(short_repr, shown_items(value)), count, _MOST_ROWS)
     return Preview(text, f"{text}: {short_repr(value)}", rows=rows or ("(empty)",))
+
+
+def _item_rows(mapping: Any) -> Iterator[str]:
+    for key, value in pairs_in(mapping):
+        yield f"{_label(key)}: {short_repr(value)}"
 
 
 def _name(value: Any) -> str:

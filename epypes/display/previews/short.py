@@ -176,16 +176,7 @@ def dtype_text(dtype: Any) -> str:
     return "records" if dtype.names else cut(str(dtype), 16)
 
 
-def row_texts(values: Iterable[Any], count: int, most: int) -> tuple[str, ...]:
-    """Return the first of so many values as lines, the last of which says how many more there are."""
-    kept = count if count <= most else most - 1
-    rows = [short_repr(value) for value in itertools.islice(iter(values), kept)]
-    return (*rows, f"... {count - len(rows)} more") if count > len(rows) else tuple(rows)
-
-
-def item_texts(mapping: Any, count: int, most: int) -> tuple[str, ...]:
-    """Return the first of so many items as lines ``key: value``."""
-    kept = count if count <= most else most - 1
-    pairs = itertools.islice(pairs_in(mapping), kept)
-    rows = [f"{key if type(key) is str else short_repr(key)}: {short_repr(value)}" for key, value in pairs]
-    return (*rows, f"... {count - kept} more") if count > kept else tuple(rows)
+def row_texts(rows: Iterable[str], count: int, most: int) -> tuple[str, ...]:
+    """Return the first of so many lines, the last of which is how many more there are."""
+    kept = list(itertools.islice(rows, count if count <= most else most - 1))
+    return (*kept, f"... {count - len(kept)} more") if count > len(kept) else tuple(kept)
