@@ -51,7 +51,11 @@ def size(text: str) -> int:
 def written_length(text: str) -> int:
     """Return how many bytes a text takes in a page at most."""
     longer = _LONG.findall(text)
-    return len(text) + sum(_LONGER.get(sign, size(_NOT_XML.sub("\ufffd", sign))) - 1 for sign in longer)
+    return (
+        len(text)
+        + sum([_LONGER.get(sign) or len(_NOT_XML.sub("\ufffd", sign).encode()) for sign in longer])
+        - len(longer)
+    )
 
 
 def cut(text: str, characters: int) -> str:

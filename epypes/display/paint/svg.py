@@ -181,7 +181,7 @@ def least_width(svg: str) -> str:
 
 def alt_text(graph: GraphView) -> str:
     """Return the graph in one sentence, for screen readers."""
-    order = ", ".join(short_name(function.name) for function in graph.functions[:12])
+    order = ", ".join(map(short_name, [function.name for function in graph.functions[:12]]))
     more = ", ..." if len(graph.functions) > 12 else ""
     functions = counted(function_count(graph), "function")
     text = f"Computational graph of {functions}: {order}{more}. {fitted(graph.caption, _CAPTION_ROOM)}".strip()

@@ -204,7 +204,7 @@ def _twin(caption: str, head: Sequence[str], rows: Iterable[str], room: int) -> 
     kept: list[str] = []
     left_out = 0
     for row in rows:
-        room -= size(row)
+        room -= len(row.encode())
         if room >= 0 and not left_out:
             kept.append(row)
         else:

@@ -38,21 +38,20 @@ class ValuePreview:
         Whether it may get one.
     is_image
         Whether the value is an image.
+    sketch
+        Refers to the value's memory, so it is forgotten once a picture is painted.
     is_constant
         Whether the value can't be changed, and the preview is made of nothing else: such a preview may be kept. A
         payload is not constant, since its owner may fill it again.
     """
 
-    __slots__ = (
-        "_made", "_range", "_reference", "_revision", "_sketch", "brief", "is_constant", "is_drawable", "is_image",
-    )  # fmt: skip
+    __slots__ = ("_made", "_range", "_reference", "brief", "is_constant", "is_drawable", "is_image", "sketch")
 
     def __init__(self, value: Any, look: Look, is_nested: bool) -> None:
-        self._sketch: Sketch | None = (sketch := sketch_in_context(value, look, is_nested))
+        self.sketch: Sketch | None = (sketch := sketch_in_context(value, look, is_nested))
         self.brief, self.is_drawable, self.is_image = sketch.shown, sketch.may_be_drawn, sketch.is_image
         self._made: tuple[Preview, int] | None = None
         self._range: Range | None = None
-        self._revision = users_revision()
         self._reference: Callable[[], Any] = lambda: value
         is_locked = self.is_image and _is_locked(value)
         if is_locked:
@@ -63,23 +62,15 @@ class ValuePreview:
 
     def is_of(self, value: Any, look: Look) -> bool:
         """Whether it is the preview of this value, in the display range that is kept now."""
-        return (
-            self._reference() is value
-            and self._revision == users_revision()
-            and (self._range is None or self._range == look.range_of(value))
-        )
+        return self._reference() is value and (self._range is None or self._range == look.range_of(value))
 
     def finished(self, value: Any, look: Look, most_bytes: int) -> Preview:
         """Return the preview with a thumbnail of at most so many bytes."""
         made = self._made
         if made is None or made[1] != most_bytes:
-            sketch = self._sketch or sketch_in_context(value, look, False)
+            sketch = self.sketch or sketch_in_context(value, look, False)
             self._made = made = finished_in_context(sketch, most_bytes), most_bytes
         return made[0]
-
-    def release(self) -> None:
-        """Forget what refers to the value's memory."""
-        self._sketch = None
 
 
 def _is_locked(array: Any) -> bool:
@@ -94,9 +85,10 @@ def _is_locked(array: Any) -> bool:
 
 
 class _Kept:
-    __slots__ = ("previews", "ranges")
+    __slots__ = ("previews", "ranges", "revision")
 
     def __init__(self) -> None:
+        self.revision = -1
         self.previews: dict[str, ValuePreview] = {}
         self.ranges: dict[tuple[str, str], Range] = {}
 
@@ -112,7 +104,11 @@ def _kept_of(program: Program) -> _Kept:
 
 def kept_previews(program: Program) -> dict[str, ValuePreview]:
     """Return the previews of a program's tokens by name, to be replaced by newer ones."""
-    return _kept_of(program).previews
+    kept = _kept_of(program)
+    if kept.revision != users_revision():
+        # A user's function may look at these values now.
+        kept.revision, kept.previews = users_revision(), {}
+    return kept.previews
 
 
 def kept_range(program: Program, token: str, image: Array) -> Range:

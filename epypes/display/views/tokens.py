@@ -120,7 +120,7 @@ def run_token_views(
         previews, dropped = _with_thumbnails(found, _rank(run, found, seen), room)
         first = _first_texts(structure, hparams, known)
     for each in found.values():
-        each.shown.release()
+        each.shown.sketch = None
 
     def state_of(token: str) -> TokenState:
         if token not in computed:
