@@ -14,9 +14,9 @@ from typing import Any, Final
 
 from epypes.display.paint.vertices import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.encoding import THUMBNAIL_PX, encode_small
+from epypes.display.previews.encoding import encode_small
 from epypes.display.previews.images import display_range, image_kind, is_image, sampled, sole_value
-from epypes.display.previews.model import Look, Sketch
+from epypes.display.previews.model import THUMBNAIL_PX, Look, Sketch
 from epypes.display.previews.preview import finished, looked_closer, sketch
 from epypes.display.previews.short import float_text
 from epypes.display.views.surroundings import RunSurroundings

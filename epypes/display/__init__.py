@@ -2,10 +2,10 @@
 
 from epypes.display.formatters import Figure, mimebundle, show, to_svg, to_text
 from epypes.display.previews.drawing import scene_picture
-from epypes.display.previews.encoding import Picture, encode_image
+from epypes.display.previews.encoding import encode_image
 from epypes.display.previews.images import is_image
 from epypes.display.previews.kept import reset_display_ranges
-from epypes.display.previews.model import Backdrop, Chart, Marks, Most, Preview, Scene
+from epypes.display.previews.model import Backdrop, Chart, Marks, Most, Picture, Preview, Scene
 from epypes.display.previews.registry import register_preview
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.surroundings import scene_of

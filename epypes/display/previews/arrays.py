@@ -6,20 +6,21 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.drawing import bar_chart, line_chart
-from epypes.display.previews.encoding import THUMBNAIL_PX, encode_small, is_pooled, label_text, pillow_image
+from epypes.display.previews.encoding import encode_small, is_pooled, pillow_image
 from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
 from epypes.display.previews.images import (
     few_of,
     image_kind,
     is_image,
     is_of_dtype,
+    label_text,
     one_channel,
     sampled,
     some_of,
     statistics_text,
 )
 from epypes.display.previews.introspection import is_of
-from epypes.display.previews.model import Backdrop, Look, Preview, Scene, Sketch
+from epypes.display.previews.model import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
 from epypes.display.previews.objects import record_sketch
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.encoding import THUMBNAIL_PX, Picture, encode_image, encode_small, pillow, pillow_image
+from epypes.display.previews.encoding import encode_image, encode_small, pillow, pillow_image
 from epypes.display.previews.images import image_kind, sampled, some_of
-from epypes.display.previews.model import Backdrop, Chart, Marks, Most, Scene
+from epypes.display.previews.model import THUMBNAIL_PX, Backdrop, Chart, Marks, Most, Picture, Scene
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -175,22 +175,17 @@ def some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = Non
     return Marks(np.empty((0, 2)), tuple(_drawable_lines(kept)), are_closed, count)
 
 
-def _drawable_lines(lines: list[Any]) -> Iterator[Floats]:
-    """Yield the lines without what can't be drawn of them; looked at together, since there may be thousands."""
+def _drawable_lines(lines: list[Any]) -> list[Floats]:
+    """Return the lines without what can't be drawn of them; looked at together, since there may be thousands."""
     import numpy as np
 
     if not lines:
-        return
-    places = np.concatenate(lines).astype(np.float64)
-    is_drawn = _is_drawable(places)
-    end = 0
-    for line in lines:
-        start, end = end, end + len(line)
-        found = places[start:end]
-        if not is_drawn[start:end].all():
-            found = found[is_drawn[start:end]]
-        if len(found):
-            yield found
+        return []
+    places, ends = np.concatenate(lines).astype(np.float64), np.cumsum(list(map(len, lines)))[:-1]
+    is_drawn, found = _is_drawable(places), np.split(places, ends)
+    if is_drawn.all():
+        return found
+    return [kept for line, is_kept in zip(found, np.split(is_drawn, ends), strict=True) if len(kept := line[is_kept])]
 
 
 def _share(lengths: Iterable[int], room: int) -> int:
@@ -350,31 +345,25 @@ class _Pen:
             return
         for start, end in itertools.pairwise(places):
             near = self._near_part(start, end)
-            if near is not None:
+            if near:
                 self._draw.line(near, fill=colour, width=width)
 
     def _is_near(self, places: Iterable[_Place]) -> bool:
         (left, top), (right, bottom) = self._low, self._high
         return all(left <= x <= right and top <= y <= bottom for x, y in places)
 
-    def _near_part(self, start: _Place, end: _Place) -> tuple[_Place, _Place] | None:
-        """Return the part of a line that is near; None if there is none, or if an end is nowhere."""
+    def _near_part(self, start: _Place, end: _Place) -> list[_Place]:
+        """Return the ends of the part of a line that is near (Liang and Barsky); none if there is none."""
+        axes = list(zip(start, end, self._low, self._high, strict=True))
         first, last = 0.0, 1.0
-        for a, b, low, high in zip(start, end, self._low, self._high, strict=True):
-            if not math.isfinite(b - a):
-                return None
-            if a == b:
-                if not low <= a <= high:
-                    return None
-                continue
-            enters, leaves = sorted(((low - a) / (b - a), (high - a) / (b - a)))
-            first, last = max(first, enters), min(last, leaves)
+        for a, b, low, high in axes:
+            if not math.isfinite(b - a) or (a == b and not low <= a <= high):
+                return []
+            if a != b:
+                enters, leaves = sorted(((low - a) / (b - a), (high - a) / (b - a)))
+                first, last = max(first, enters), min(last, leaves)
         if first > last:
-            return None
-        return self._between(start, end, first), self._between(start, end, last)
-
-    def _between(self, start: _Place, end: _Place, share: float) -> _Place:
+            return []
         # Within limits once more: of very large numbers the difference is not exact.
-        ends = zip(start, end, self._low, self._high, strict=True)
-        x, y = (min(max(a + share * (b - a), low), high) for a, b, low, high in ends)
-        return x, y
+        parts = [[min(max(a + share * (b - a), low), high) for a, b, low, high in axes] for share in (first, last)]
+        return [(x, y) for x, y in parts]

@@ -13,13 +13,12 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.images import Range, display_range, image_kind, is_image, is_mask, one_channel, sampled
+from epypes.display.previews.images import Range, display_range, image_kind, is_mask, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
+from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
 from epypes.optional import optional_import
-from epypes.wording import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,23 +28,10 @@ if TYPE_CHECKING:
     from epypes.display.previews.model import Array
     from epypes.images import Order
 
-# Byte 0 is black, for label 0; byte 255 is white, for what is negative, as the borders of cv2.watershed.
-_LABEL_COLOURS: Final = 254
-_WHITE: Final = 255
-_GOLDEN: Final = 0.618033988749895
-# Neighbouring numbers get hues far apart, and four numbers in a row differ in brightness, too.
-_TONES: Final = ((0.60, 0.95), (0.85, 0.75), (0.45, 1.00), (0.75, 0.88))
-
-
-@functools.cache
-def palette() -> bytes:
-    """Return 256 colours of three bytes."""
-    colours = bytearray(3)
-    for index in range(_LABEL_COLOURS):
-        saturation, brightness = _TONES[index % len(_TONES)]
-        colour = colorsys.hsv_to_rgb((0.58 + index * _GOLDEN) % 1.0, saturation, brightness)
-        colours += bytes(round(255 * channel) for channel in colour)
-    return bytes(colours) + b"\xff\xff\xff"
+JPEG_QUALITY: Final = 80
+_QUALITIES: Final = (68, 55, 42)
+_COLOURS: Final = 48
+_LEAST_SIDE_PX: Final = 16
 
 
 @functools.cache
@@ -55,96 +41,6 @@ def pillow() -> Any:
         from PIL import Image
 
     return Image
-
-
-def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
-    """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
-    import numpy as np
-
-    stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
-    kept = labels[::stride, ::stride]
-    numbers = np.where(kept > 0, (kept.astype(np.int64) - 1) % _LABEL_COLOURS + 1, np.where(kept < 0, _WHITE, 0))
-    picture: Image.Image = pillow().fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
-    picture.putpalette(palette())
-    return picture
-
-
-def label_text(sample: Array) -> str:
-    """Return how many labels there are besides 0."""
-    import numpy as np
-
-    positive = sample[sample > 0]
-    is_narrow = positive.size > 0 and int(positive.max()) <= 10 * sample.size
-    count = int(np.count_nonzero(np.bincount(positive))) if is_narrow else len(np.unique(positive))
-    return counted(count, "label")
-
-
-_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-_DEPTH: Final = 1
-_GRAYSCALE: Final = 0
-# Masks are runs: longer matches than those of one byte are rarely found, and looking for them takes most of the time.
-_LEVEL: Final = 1
-_MEMORY: Final = 9
-
-
-def bitmap_png(mask: Array) -> bytes:
-    """Return a mask as a grayscale PNG whose pixels are black and white.
-
-    Parameters
-    ----------
-    mask
-        (height, width), bool or bytes; what is not 0 is white.
-    """
-    import numpy as np
-
-    height, width = mask.shape
-    packed = np.packbits(mask, axis=1)
-    rows = np.zeros((height, packed.shape[1] + 1), np.uint8)
-    rows[:, 1:] = packed  # each row begins with its filter, which is none
-    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, zlib.MAX_WBITS, _MEMORY, zlib.Z_RLE)
-    data = packer.compress(rows.tobytes()) + packer.flush()
-    header = struct.pack(">IIBBBBB", width, height, _DEPTH, _GRAYSCALE, 0, 0, 0)
-    return _SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-__all__ = ["THUMBNAIL_BYTES", "THUMBNAIL_PX", "Picture", "encode_image", "encode_small", "is_image", "pillow_image"]
-
-THUMBNAIL_PX: Final = 128
-THUMBNAIL_BYTES: Final = 5_000
-JPEG_QUALITY: Final = 80
-_QUALITIES: Final = (68, 55, 42)
-# Of a line, half or a quarter is left by mean: it is made brighter again. Few greys, which compress well.
-_GREYS: Final = 4
-_BRIGHTER: Final = [round((_GREYS - 1) * (level / 255) ** 0.5) for level in range(256)]
-_COLOURS: Final = 48
-_LEAST_SIDE_PX: Final = 16
-_MOST_POOLED_PX: Final = 16_000_000
-# So many pixels of a very large mask, along each side, make one of the thumbnail.
-_SAMPLED: Final = 4
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An encoded picture.
-
-    Attributes
-    ----------
-    data
-        The bytes of the file.
-    media_type
-        ``"image/jpeg"`` or ``"image/png"``.
-    width, height
-        Its size, in pixels.
-    """
-
-    data: bytes = field(repr=False)
-    media_type: str
-    width: int
-    height: int
 
 
 def encode_image(
@@ -263,6 +159,26 @@ def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
     return picture.resize(size, pillow().Resampling.BOX)
 
 
+def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bool = False) -> Picture:
+    stream = io.BytesIO()
+    kind = "JPEG" if picture.mode in ("L", "RGB") else "PNG"
+    if kind == "JPEG":
+        picture.save(stream, kind, quality=quality, subsampling=0 if full_colours else -1)
+    else:
+        picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 6)
+    return Picture(stream.getvalue(), f"image/{kind.lower()}", picture.width, picture.height)
+
+
+# -- masks -------------------------------------------------------------------------------------------------------------
+
+# Of a line, half or a quarter is left by mean: it is made brighter again. Few greys, which compress well.
+_GREYS: Final = 4
+_BRIGHTER: Final = [round((_GREYS - 1) * (level / 255) ** 0.5) for level in range(256)]
+_MOST_POOLED_PX: Final = 16_000_000
+# So many pixels of a very large mask, along each side, make one of the thumbnail.
+_SAMPLED: Final = 4
+
+
 def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     """Shrink to twice the size by maximum, and from there by mean: thin lines stay, and stay thinner than areas."""
     doubled = _mask_picture(mask, 2 * max_side_px).convert("L")
@@ -312,11 +228,66 @@ def _pooled(bits: Array, pool: int) -> Array:
     return np.concatenate([pooled, np.bitwise_or.reduce(rest, axis=0, keepdims=True)]) if len(rest) else pooled
 
 
-def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bool = False) -> Picture:
-    stream = io.BytesIO()
-    kind = "JPEG" if picture.mode in ("L", "RGB") else "PNG"
-    if kind == "JPEG":
-        picture.save(stream, kind, quality=quality, subsampling=0 if full_colours else -1)
-    else:
-        picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 6)
-    return Picture(stream.getvalue(), f"image/{kind.lower()}", picture.width, picture.height)
+_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_DEPTH: Final = 1
+_GRAYSCALE: Final = 0
+# Masks are runs: longer matches than those of one byte are rarely found, and looking for them takes most of the time.
+_LEVEL: Final = 1
+_MEMORY: Final = 9
+
+
+def bitmap_png(mask: Array) -> bytes:
+    """Return a mask as a grayscale PNG whose pixels are black and white.
+
+    Parameters
+    ----------
+    mask
+        (height, width), bool or bytes; what is not 0 is white.
+    """
+    import numpy as np
+
+    height, width = mask.shape
+    packed = np.packbits(mask, axis=1)
+    rows = np.zeros((height, packed.shape[1] + 1), np.uint8)
+    rows[:, 1:] = packed  # each row begins with its filter, which is none
+    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, zlib.MAX_WBITS, _MEMORY, zlib.Z_RLE)
+    data = packer.compress(rows.tobytes()) + packer.flush()
+    header = struct.pack(">IIBBBBB", width, height, _DEPTH, _GRAYSCALE, 0, 0, 0)
+    return _SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+# -- labels ------------------------------------------------------------------------------------------------------------
+
+# Byte 0 is black, for label 0; byte 255 is white, for what is negative, as the borders of cv2.watershed.
+_LABEL_COLOURS: Final = 254
+_WHITE: Final = 255
+_GOLDEN: Final = 0.618033988749895
+# Neighbouring numbers get hues far apart, and four numbers in a row differ in brightness, too.
+_TONES: Final = ((0.60, 0.95), (0.85, 0.75), (0.45, 1.00), (0.75, 0.88))
+
+
+@functools.cache
+def palette() -> bytes:
+    """Return 256 colours of three bytes."""
+    colours = bytearray(3)
+    for index in range(_LABEL_COLOURS):
+        saturation, brightness = _TONES[index % len(_TONES)]
+        colour = colorsys.hsv_to_rgb((0.58 + index * _GOLDEN) % 1.0, saturation, brightness)
+        colours += bytes(round(255 * channel) for channel in colour)
+    return bytes(colours) + b"\xff\xff\xff"
+
+
+def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
+    """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
+    import numpy as np
+
+    stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
+    kept = labels[::stride, ::stride]
+    numbers = np.where(kept > 0, (kept.astype(np.int64) - 1) % _LABEL_COLOURS + 1, np.where(kept < 0, _WHITE, 0))
+    picture: Image.Image = pillow().fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
+    picture.putpalette(palette())
+    return picture

@@ -9,11 +9,13 @@ import math
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.display.previews.introspection import is_of
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     from epypes.display.previews.model import Array
 
 
+Range = tuple[float, float]
 ImageKind = Literal["mask", "labels", "photograph"]
 
 SMALLEST_SIDE_PX: Final = 8
@@ -128,8 +130,6 @@ def _has_pieces(image: Array, largest: int) -> bool:
     is_smooth = largest > _FEW_LABELS and by_one > _SMALL_STEPS * differing
     return differing > 0 and not is_smooth and equal >= least_equal * touching
 
-
-Range = tuple[float, float]
 
 # Cameras of 10, 12 and 14 bits write into 16.
 _BITS: Final = (8, 10, 12, 14, 16)
@@ -276,3 +276,13 @@ def memory_text(size: int) -> str:
         if size >= limit:
             return f"{size / limit:.3g} {unit}"
     return f"{size} B"
+
+
+def label_text(sample: Array) -> str:
+    """Return how many labels there are besides 0."""
+    import numpy as np
+
+    positive = sample[sample > 0]
+    is_narrow = positive.size > 0 and int(positive.max()) <= 10 * sample.size
+    count = int(np.count_nonzero(np.bincount(positive))) if is_narrow else len(np.unique(positive))
+    return counted(count, "label")

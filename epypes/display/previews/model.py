@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.display.previews.encoding import Picture
 from epypes.display.previews.images import Range, display_range
 from epypes.images import Order
 
@@ -17,10 +16,32 @@ if TYPE_CHECKING:
     Array = npt.NDArray[Any]
     Floats = npt.NDArray[np.float64]
 
+THUMBNAIL_PX: Final = 128
+THUMBNAIL_BYTES: Final = 5_000
 # On a thumbnail.
 MOST_MARKS: Final = 200
 # More lines than that, from one image to another, cover both.
 MOST_PAIRS: Final = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An encoded picture.
+
+    Attributes
+    ----------
+    data
+        The bytes of the file.
+    media_type
+        ``"image/jpeg"`` or ``"image/png"``.
+    width, height
+        Its size, in pixels.
+    """
+
+    data: bytes = field(repr=False)
+    media_type: str
+    width: int
+    height: int
 
 
 @dataclass(frozen=True, slots=True)

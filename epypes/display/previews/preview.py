@@ -11,10 +11,10 @@ from typing import Any, Final
 
 from epypes.display.previews import arrays, objects
 from epypes.display.previews.drawing import MOST_LINES, MOST_POINTS
-from epypes.display.previews.encoding import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture, encode_small, pillow
+from epypes.display.previews.encoding import encode_small, pillow
 from epypes.display.previews.images import is_image
 from epypes.display.previews.introspection import kind_name, looking, plain_text
-from epypes.display.previews.model import Chart, Look, Preview, Scene, Sketch
+from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Chart, Look, Picture, Preview, Scene, Sketch
 from epypes.display.previews.registry import looker_of
 from epypes.display.previews.short import reason
 from epypes.display.text import cut

@@ -6,10 +6,9 @@ from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from epypes.display.previews.encoding import THUMBNAIL_BYTES
 from epypes.display.previews.introspection import looking
 from epypes.display.previews.kept import ValuePreview, kept_previews, kept_range
-from epypes.display.previews.model import Look, Preview
+from epypes.display.previews.model import THUMBNAIL_BYTES, Look, Preview
 from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.views.graphview import GraphView, TokenState, TokenView
 from epypes.display.views.surroundings import RunSurroundings
