@@ -22,7 +22,7 @@ from epypes.display.previews.images import (
 from epypes.display.previews.introspection import is_of
 from epypes.display.previews.model import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
 from epypes.display.previews.objects import record_sketch
-from epypes.display.previews.registry import ours
+from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
 from epypes.display.text import cut
 
@@ -39,7 +39,7 @@ _LEAST_BINS: Final = 8
 _PLACES: Final = ((2,), (1, 2), (1, 4), (4,))
 
 
-@ours("numpy.generic")
+@built_in("numpy.generic")
 def _number_sketch(number: Any, look: Look) -> Preview:
     """Look at a number of numpy, which has a dtype and no axes."""
     if number.dtype.kind in "mM":
@@ -56,7 +56,7 @@ def plain_array(array: Any) -> Array:
     return np.asarray(array)
 
 
-@ours("numpy.ndarray")
+@built_in("numpy.ndarray")
 def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     """Look at an array by its shape and dtype."""
     array = plain_array(array)

@@ -15,10 +15,14 @@ from contextvars import ContextVar
 from types import FunctionType, GetSetDescriptorType, MappingProxyType, MemberDescriptorType, SimpleNamespace
 from typing import Any, Final
 
-_name_of: Final = type.__dict__["__name__"].__get__
-_qualified_name_of: Final = type.__dict__["__qualname__"].__get__
+# The name of a class, its name within its module, and the class with its parents in the order in which Python asks
+# them. These never raise, whatever a metaclass says.
+kind_name: Final[Callable[[type], str]] = type.__dict__["__name__"].__get__
+qualified_name: Final[Callable[[type], str]] = type.__dict__["__qualname__"].__get__
+parents: Final[Callable[[type], tuple[type, ...]]] = type.__dict__["__mro__"].__get__
+# A text whose class is str, whatever a subclass makes of its methods.
+plain_text: Final[Callable[[str], str]] = str.__str__
 _module_of: Final = type.__dict__["__module__"].__get__
-_parents_of: Final = type.__dict__["__mro__"].__get__
 _attributes_of: Final = type.__dict__["__dict__"].__get__
 # Their length is known to Python itself. Subclasses may compute theirs, and are asked for that of their parent.
 _SIZED: Final[tuple[Any, ...]] = (
@@ -30,18 +34,6 @@ _MAPPINGS: Final[tuple[Any, ...]] = (OrderedDict, dict, MappingProxyType)
 _PANDAS: Final = ("DataFrame", "Series", "Index")
 
 
-def kind_name(kind: type) -> str:
-    """Return the name of a class; never raises."""
-    name: str = _name_of(kind)
-    return name
-
-
-def qualified_name(kind: type) -> str:
-    """Return the name of a class within its module; never raises."""
-    name: str = _qualified_name_of(kind)
-    return name
-
-
 def dotted_name(kind: type) -> str:
     """Return where a class is from, ``"package.module.Pose"``; never raises."""
     try:
@@ -50,15 +42,9 @@ def dotted_name(kind: type) -> str:
         return qualified_name(kind)
 
 
-def parents(kind: type) -> tuple[type, ...]:
-    """Return a class and those that it is made from, in the order in which Python asks them."""
-    found: tuple[type, ...] = _parents_of(kind)
-    return found
-
-
 def declared(kind: type, name: str) -> Any:
     """Return an attribute as it stands in a class or the nearest of its parents; None if there is none."""
-    for parent in _parents_of(kind):
+    for parent in parents(kind):
         attributes = _attributes_of(parent)
         if name in attributes:
             return attributes[name]
@@ -81,7 +67,7 @@ def is_of(value: Any, package: str, *names: str) -> bool:
     module = sys.modules.get(package)
     if module is None:
         return False
-    ancestors = _parents_of(type(value))
+    ancestors = parents(type(value))
     for name in names:
         known = getattr(module, name, None)
         # By identity, since a class may say of itself that it equals another.
@@ -118,11 +104,6 @@ def pairs_in(value: Any) -> Iterator[tuple[Any, Any]]:
     if known is None:
         raise TypeError(f"the items of {kind_name(type(value))} are not known")
     return iter(known.items(value))
-
-
-def plain_text(text: str) -> str:
-    """Return a text whose class is str, whatever a subclass makes of its methods."""
-    return str.__str__(text)
 
 
 def _first_of(kinds: Iterable[Any], value: Any) -> Any:
@@ -178,7 +159,7 @@ def _is_written_by_fields(kind: type) -> bool:
     return type(made) is FunctionType and "__create_fn__" in made.__qualname__
 
 
-_is_looking: Final = ContextVar("_is_looking", default=False)
+_is_in_preview: Final = ContextVar("_is_in_preview", default=False)
 
 
 def silent_numpy() -> AbstractContextManager[Any]:
@@ -188,7 +169,7 @@ def silent_numpy() -> AbstractContextManager[Any]:
 
 
 @contextmanager
-def looking() -> Iterator[bool]:
+def preview_context() -> Iterator[bool]:
     """Look at a value: numpy keeps silent about numbers that overflow.
 
     Yields
@@ -197,10 +178,10 @@ def looking() -> Iterator[bool]:
         Whether another value is being looked at meanwhile, since a function or repr of a user's shows a picture. One
         that shows the run that its own value is in would never come to an end.
     """
-    is_nested = _is_looking.get()
-    token = _is_looking.set(True)
+    is_nested = _is_in_preview.get()
+    token = _is_in_preview.set(True)
     try:
         with silent_numpy():
             yield is_nested
     finally:
-        _is_looking.reset(token)
+        _is_in_preview.reset(token)

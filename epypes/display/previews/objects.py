@@ -14,7 +14,7 @@ from epypes.display.previews.features import list_sketch
 from epypes.display.previews.images import memory_text, some_of, statistics_text
 from epypes.display.previews.introspection import fields_of, is_of, items_in, kind_name, length_of, pairs_in, stored
 from epypes.display.previews.model import Look, Preview, Sketch
-from epypes.display.previews.registry import ours
+from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items
 from epypes.display.text import cut
 from epypes.wording import counted
@@ -26,7 +26,7 @@ _ROW_CHARACTERS: Final = 60
 
 
 # pandas 3 says where a class is imported from, earlier ones where it is defined.
-@ours("pandas.DataFrame", "pandas.core.frame.DataFrame")
+@built_in("pandas.DataFrame", "pandas.core.frame.DataFrame")
 def _frame(frame: Any, look: Look) -> Preview:
     names = [_label(name) for name in itertools.islice(frame.columns, _NAMED)]
     kinds = [str(kind) for kind in itertools.islice(frame.dtypes, _NAMED)]
@@ -35,7 +35,7 @@ def _frame(frame: Any, look: Look) -> Preview:
     return _table(len(frame), frame.shape[1], names, list(rows), f"DataFrame: {columns}")
 
 
-@ours("pandas.Series", "pandas.core.series.Series")
+@built_in("pandas.Series", "pandas.core.series.Series")
 def _series(series: Any, look: Look) -> Preview:
     rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
     name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
@@ -93,7 +93,7 @@ _PLAIN_TUPLE: Final = 4
 _NUMBERS: Final = (int, float, bool)
 
 
-@ours(int, str, bytes, bytearray, complex, type(None))
+@built_in(int, str, bytes, bytearray, complex, type(None))
 def _plain(value: Any, look: Look) -> Preview:
     if issubclass(type(type(value)), enum.EnumType):
         return _enum(value, look)
@@ -103,32 +103,32 @@ def _plain(value: Any, look: Look) -> Preview:
     return Preview(short, f"{_name(value)}{size} {short}")
 
 
-@ours(float)
+@built_in(float)
 def _float(value: float, look: Look) -> Preview:
     if issubclass(type(type(value)), enum.EnumType) or not math.isfinite(value):
         return _plain(value, look)
     return Preview(float_text(value), f"{_name(value)} {float.__repr__(value)}")
 
 
-@ours(enum.Enum)
+@built_in(enum.Enum)
 def _enum(value: Any, look: Look) -> Preview:
     (name,), (content,) = stored(value, "_name_"), stored(value, "_value_")
     text = f"{_name(value)}.{name}"
     return Preview(text, f"{text} = {short_repr(content)}")
 
 
-@ours(BaseException)
+@built_in(BaseException)
 def _exception(value: BaseException, look: Look) -> Preview:
     return Preview(reason(value), reason(value, 200))
 
 
-@ours("pathlib.PurePath", "pathlib._local.PurePath")
+@built_in("pathlib.PurePath", "pathlib._local.PurePath")
 def _path(value: Any, look: Look) -> Preview:
     text = os.fspath(value)
     return Preview(value.name or text, f"{_name(value)} {cut(text, 200)}")
 
 
-@ours(list)
+@built_in(list)
 def _list(value: Sequence[Any], look: Look) -> Sketch | Preview:
     # A subclass may have ways of its own to reach its items, which are not used.
     plain = value if type(value) is list else list(items_in(value))
@@ -137,7 +137,7 @@ def _list(value: Sequence[Any], look: Look) -> Sketch | Preview:
     return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
 
 
-@ours(tuple)
+@built_in(tuple)
 def _tuple(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
     plain = value if type(value) is tuple else tuple(items_in(value))
     if is_histogram(plain):
@@ -150,12 +150,12 @@ def _tuple(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
     return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
 
 
-@ours(set, frozenset)
+@built_in(set, frozenset)
 def _set(value: Any, look: Look) -> Preview:
     return _items(value)
 
 
-@ours(dict, "types.MappingProxyType", "builtins.mappingproxy")
+@built_in(dict, "types.MappingProxyType", "builtins.mappingproxy")
 def _dict(value: Any, look: Look) -> Preview:
     count = length_of(value) or len(value)
     rows = row_texts(_item_rows(value), count, _MOST_ROWS) or ("(empty)",)
@@ -179,7 +179,7 @@ def is_histogram(value: Any) -> bool:
     return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
 
 
-@ours(object)
+@built_in(object)
 def _object(value: Any, look: Look) -> Preview:
     fields = fields_of(value)
     if fields is not None:

@@ -13,9 +13,9 @@ from epypes.display.previews import arrays, objects
 from epypes.display.previews.drawing import MOST_LINES, MOST_POINTS
 from epypes.display.previews.encoding import encode_small, pillow
 from epypes.display.previews.images import is_image
-from epypes.display.previews.introspection import kind_name, looking, plain_text
+from epypes.display.previews.introspection import kind_name, plain_text, preview_context
 from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Chart, Look, Picture, Preview, Scene, Sketch
-from epypes.display.previews.registry import looker_of
+from epypes.display.previews.registry import preview_function_of
 from epypes.display.previews.short import reason
 from epypes.display.text import cut
 from epypes.images import Order
@@ -39,23 +39,23 @@ def preview(value: Any, order: Order = "bgr") -> Preview:
 
 def sketch(value: Any, look: Look) -> Sketch:
     """Look at a value without making its thumbnail; never raises. What is looked at meanwhile is but named."""
-    with looking() as is_nested:
+    with preview_context() as is_nested:
         return sketch_in_context(value, look, is_nested)
 
 
 def sketch_in_context(value: Any, look: Look, is_nested: bool) -> Sketch:
-    """Look at a value like ``sketch``, where several are looked at within one ``looking()``."""
+    """Look at a value like ``sketch``, where several are looked at within one ``preview_context()``."""
     if is_nested:
         return Sketch(Preview(_kind(value), _kind(value)))
     try:
-        return _checked(looker_of(type(value))(value, look), value, look)
+        return _checked(preview_function_of(type(value))(value, look), value, look)
     except Exception as error:
         return Sketch(_failed(Preview("", _kind(value)), "no preview", error))
 
 
 def looked_closer(sketched: Sketch) -> Sketch:
     """Return what is shown once there is room for a thumbnail, which is not made yet. Never raises."""
-    with looking():
+    with preview_context():
         return _closer(sketched)
 
 
@@ -68,12 +68,12 @@ def _closer(sketched: Sketch) -> Sketch:
 
 def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
     """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
-    with looking():
+    with preview_context():
         return finished_in_context(sketched, most_bytes)
 
 
 def finished_in_context(sketched: Sketch, most_bytes: int) -> Preview:
-    """Return a preview like ``finished``, where several are made within one ``looking()``."""
+    """Return a preview like ``finished``, where several are made within one ``preview_context()``."""
     sketched = _closer(sketched)
     try:
         drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
@@ -86,7 +86,7 @@ def finished_in_context(sketched: Sketch, most_bytes: int) -> Preview:
 
 def scene_in(sketched: Sketch) -> Scene | None:
     """Return the image of a sketch and what is drawn over it; None if it has none. Never raises."""
-    with looking():
+    with preview_context():
         try:
             found = sketched if sketched.closer is None else sketched.closer()
             return found.scene() if isinstance(found, Sketch) and found.scene is not None else None

@@ -16,8 +16,8 @@ from epypes.run.guard import lend
 
 _Function = TypeVar("_Function", bound=Callable[[Any], Any])
 # What a preview function may return is checked where it is called.
-Looker = Callable[[Any, Look], Any]
-_Looker = TypeVar("_Looker", bound=Looker)
+PreviewFunction = Callable[[Any, Look], Any]
+_BuiltIn = TypeVar("_BuiltIn", bound=PreviewFunction)
 
 
 class _Registry:
@@ -25,32 +25,32 @@ class _Registry:
 
     def __init__(self) -> None:
         # Weak, so that a class of a notebook that was defined again can go.
-        self._by_class: WeakKeyDictionary[type, Looker] = WeakKeyDictionary()
-        self._by_name: dict[str, Looker] = {}
+        self._by_class: WeakKeyDictionary[type, PreviewFunction] = WeakKeyDictionary()
+        self._by_name: dict[str, PreviewFunction] = {}
         self.revision = 0
 
-    def add(self, kind: type | str, looker: Looker) -> None:
+    def add(self, kind: type | str, function: PreviewFunction) -> None:
         """Take a function for a class or a dotted name; it replaces an earlier one."""
         self.revision += 1
         if isinstance(kind, type):
-            self._by_class[kind] = looker
+            self._by_class[kind] = function
         else:
-            self._by_name[kind] = looker
+            self._by_name[kind] = function
 
-    def get(self, kind: type) -> Looker | None:
+    def get(self, kind: type) -> PreviewFunction | None:
         """Return the function of this very class."""
         found = self._by_class.get(kind)
         return found if found or not self._by_name else self._by_name.get(dotted_name(kind))
 
 
-_ours: Final = _Registry()
+_built_in: Final = _Registry()
 _users: Final = _Registry()
 
 
-def looker_of(kind: type) -> Looker:
+def preview_function_of(kind: type) -> PreviewFunction:
     """Return the function that looks at values of a class; of two for one class, the user's."""
     for parent in parents(kind):
-        found = _users.get(parent) or _ours.get(parent)
+        found = _users.get(parent) or _built_in.get(parent)
         if found is not None:
             return found
     raise TypeError(f"nothing is registered for {kind_name(kind)}")
@@ -66,13 +66,13 @@ def users_revision() -> int:
     return _users.revision
 
 
-def ours(*kinds: type | str) -> Callable[[_Looker], _Looker]:
+def built_in(*kinds: type | str) -> Callable[[_BuiltIn], _BuiltIn]:
     """Register a function of this package, as a decorator."""
 
-    def register(looker: _Looker) -> _Looker:
+    def register(function: _BuiltIn) -> _BuiltIn:
         for kind in kinds:
-            _ours.add(kind, looker)
-        return looker
+            _built_in.add(kind, function)
+        return function
 
     return register
 

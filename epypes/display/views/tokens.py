@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from epypes.display.previews.introspection import looking
+from epypes.display.previews.introspection import preview_context
 from epypes.display.previews.kept import ValuePreview, kept_previews, kept_range
 from epypes.display.previews.model import THUMBNAIL_BYTES, Look, Preview
 from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
@@ -69,7 +69,7 @@ def token_views(
     targets: Collection[str] = (),
 ) -> tuple[TokenView, ...]:
     """Look at tokens of which only hyperparameters have a value; those of ``targets`` get a thumbnail before others."""
-    with looking() as is_nested:
+    with preview_context() as is_nested:
         known = _Known({}, is_nested)
         found = {
             token.name: known.find(token.name, hparams.values[token.name], Look(token.order))
@@ -109,7 +109,7 @@ def run_token_views(
     values, program, producer = run.tokens.values, run.tokens.program, run.cg.digraph.producer
     computed = {name: value for name, value in zip(program.tokens, values, strict=True) if value is not NOT_COMPUTED}
     shown = {**computed, **hparams.values}
-    with looking() as is_nested:
+    with preview_context() as is_nested:
         known = _Known(kept_previews(program), is_nested)
         found = {}
         for token in structure.tokens:
