@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.settings import fits, read, written
+from epypes.bundle.settings import decode_value, encode_value, fits
 from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
 from epypes.graph import CompGraph, annotated_params
@@ -172,7 +172,7 @@ def _entry(value: Any) -> Any:
     with optional_import("widgets"):
         import tomlkit
 
-    entry = {"value": value.name, "kind": _MEMBER} if isinstance(value, enum.Enum) else written(plain(value))
+    entry = {"value": value.name, "kind": _MEMBER} if isinstance(value, enum.Enum) else encode_value(plain(value))
     if entry.keys() == {"value"}:
         return entry["value"]
     table = tomlkit.inline_table()
@@ -260,7 +260,7 @@ def _value(token: str, entry: Any) -> Any:
     try:
         if _is_member(entry):
             return entry["value"]
-        value = read(entry) if isinstance(entry, dict) else entry
+        value = decode_value(entry) if isinstance(entry, dict) else entry
     except (KeyError, TypeError) as error:
         raise ValueError(f"Hyperparameter {token!r} is a table without a value.") from error
     if not fits(value):
