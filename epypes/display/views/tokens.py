@@ -67,69 +67,60 @@ def token_views(
     state_of: Callable[[str], TokenState],
     room: Room,
     targets: Collection[str] = (),
-) -> tuple[TokenView, ...]:
-    """Look at tokens of which only hyperparameters have a value; those of ``targets`` get a thumbnail before others."""
-    with preview_context() as is_nested:
-        known = _Known({}, is_nested)
-        found = {
-            token.name: known.find(token.name, hparams.values[token.name], Look(token.order))
-            for token in structure.tokens
-            if token.name in hparams.values
-        }
-        previews, _ = _with_thumbnails(found, lambda name: name not in targets, room)
-        first = _first_texts(structure, hparams, known)
-    return _views(structure, hparams, state_of, previews, first)
-
-
-def run_token_views(
-    structure: GraphView,
-    hparams: Hyperparameters,
-    run: Run,
-    stale: Collection[str],
-    room: Room,
-    seen: Collection[str] = (),
+    run: Run | None = None,
 ) -> tuple[tuple[TokenView, ...], int]:
-    """Look at the values of a run and at these hyperparameters.
+    """Look at hyperparameters and, if there is one, at the values of a run.
 
-    Sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the others. What
-    can't have changed since the last picture is not looked at again.
+    Of a run sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the
+    others. What can't have changed since the last picture is not looked at again.
 
     Parameters
     ----------
-    stale
-        The functions that are out of date since the run.
-    seen
-        The tokens that are seen at once, if only some are: they come before all others.
+    state_of
+        Returns the state of a token that is no hyperparameter.
+    targets
+        The tokens that get a thumbnail before others.
 
     Returns
     -------
     tuple
         The tokens, and how many thumbnails were left out.
     """
-    values, program, producer = run.tokens.values, run.tokens.program, run.cg.digraph.producer
-    computed = {name: value for name, value in zip(program.tokens, values, strict=True) if value is not NOT_COMPUTED}
-    shown = {**computed, **hparams.values}
+    program = None if run is None else run.tokens.program
+    values = {**_computed(run), **hparams.values}
     with preview_context() as is_nested:
-        known = _Known(kept_previews(program), is_nested)
-        found = {}
+        known = _Known({} if program is None else kept_previews(program), is_nested)
+        found: dict[str, _Found] = {}
         for token in structure.tokens:
-            if (name := token.name) in shown:
-                look = Look(token.order, partial(kept_range, program, name), RunSurroundings(run, name))
-                found[name] = known.find(name, shown[name], look)
-        previews, dropped = _with_thumbnails(found, _rank(run, found, seen), room)
+            if (name := token.name) in values:
+                look = Look(token.order)
+                if run is not None and program is not None:
+                    look = Look(token.order, partial(kept_range, program, name), RunSurroundings(run, name))
+                found[name] = known.find(name, values[name], look)
+        previews, dropped = _with_thumbnails(found, _rank(run, found, targets), room)
         first = _first_texts(structure, hparams, known)
     for each in found.values():
         each.shown.sketch = None
 
-    def state_of(token: str) -> TokenState:
-        if token not in computed:
-            return "not computed"
-        return "stale" if producer.get(token) in stale else "fresh"
+    def view(token: TokenView) -> TokenView:
+        name, is_hyperparameter = token.name, token.name in hparams.values
+        state = token.state if token.state == "left out" else "fresh" if is_hyperparameter else state_of(name)
+        role = "hyperparameter" if is_hyperparameter else token.role
+        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""))
 
-    return _views(structure, hparams, state_of, previews, first), dropped
+    return tuple(map(view, structure.tokens)), dropped
 
 
-def _rank(run: Run, found: Mapping[str, _Found], seen: Collection[str]) -> Rank:
+def _computed(run: Run | None) -> dict[str, Any]:
+    if run is None:
+        return {}
+    pairs = zip(run.tokens.program.tokens, run.tokens.values, strict=True)
+    return {name: value for name, value in pairs if value is not NOT_COMPUTED}
+
+
+def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]) -> Rank:
+    if run is None:
+        return lambda token: token not in targets
     sinks, producer, ran = frozenset(run.cg.sink_tokens), run.cg.digraph.producer, run.report.durations_ns
 
     def rank(token: str) -> tuple[bool, int]:
@@ -139,7 +130,7 @@ def _rank(run: Run, found: Mapping[str, _Found], seen: Collection[str]) -> Rank:
             place = 1
         else:
             place = 2 if producer.get(token) in ran else 3
-        return bool(seen) and token not in seen, place
+        return token not in targets, place
 
     return rank
 
@@ -154,22 +145,6 @@ def _first_texts(structure: GraphView, hparams: Hyperparameters, known: _Known) 
             if first is not value and not is_same_value(first, value):
                 texts[name] = known.find(f"first {name}", first, Look(token.order)).shown.brief.text
     return texts
-
-
-def _views(
-    structure: GraphView,
-    hparams: Hyperparameters,
-    state_of: Callable[[str], TokenState],
-    previews: Mapping[str, Preview],
-    first: Mapping[str, str],
-) -> tuple[TokenView, ...]:
-    def view(token: TokenView) -> TokenView:
-        name, is_hyperparameter = token.name, token.name in hparams.values
-        state = token.state if token.state == "left out" else "fresh" if is_hyperparameter else state_of(name)
-        role = "hyperparameter" if is_hyperparameter else token.role
-        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""))
-
-    return tuple(map(view, structure.tokens))
 
 
 def _with_thumbnails(found: Mapping[str, _Found], rank: Rank, room: Room) -> tuple[dict[str, Preview], int]:

@@ -19,10 +19,10 @@ from epypes.display.text import (
     overhead_text,
     short_name,
 )
-from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView
+from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView, TokenState
 from epypes.display.views.groups import collapsed, groups_of, outside_tokens, twice_seen
 from epypes.display.views.structure import structure_of
-from epypes.display.views.tokens import ROOM, Hyperparameters, Room, run_token_views, token_views
+from epypes.display.views.tokens import ROOM, Hyperparameters, Room, token_views
 from epypes.errors import UnknownName, run_call
 from epypes.graph import CompGraph
 from epypes.graph.renaming import names_of
@@ -129,7 +129,7 @@ def _whole(shown: Shown, room: Room, closed: Mapping[str, Sequence[str]]) -> Gra
     if isinstance(shown, CompGraph):
         # Tokens with a default are shown as the hyperparameters that a runner makes of them.
         structure, hparams = structure_of(shown, {}, ()), Hyperparameters(shown.defaults)
-        return replace(structure, tokens=token_views(structure, hparams, lambda name: "static", room))
+        return replace(structure, tokens=token_views(structure, hparams, lambda name: "static", room)[0])
     if isinstance(shown, Plan):
         return plan_view(shown, room)
     if isinstance(shown, Run):
@@ -169,7 +169,14 @@ def _run_view(
     steps, report = run.tokens.program.steps, run.report
     stale |= {steps[index].name for index in run.tokens.stale}
     seen = outside_tokens(structure, closed) if closed else ()
-    tokens, dropped = run_token_views(structure, hparams, run, stale, room, seen)
+    producer = run.cg.digraph.producer
+
+    def state_of(token: str) -> TokenState:
+        if not run.tokens.is_computed(token):
+            return "not computed"
+        return "stale" if producer.get(token) in stale else "fresh"
+
+    tokens, dropped = token_views(structure, hparams, state_of, room, seen, run)
     overhead = f"{overhead_text(report.side_by_side)} {duration_text(report.overhead_ns)}"
     caption = f"{duration_text(report.total_ns)} in all, {overhead}"
     if dropped:
@@ -214,7 +221,7 @@ def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Seque
             function if function.state == "left out" else function._replace(state="not run")
             for function in structure.functions
         )
-        tokens = token_views(structure, hparams, lambda name: "not computed", room)
+        tokens, _ = token_views(structure, hparams, lambda name: "not computed", room)
         graph = _captioned(structure, "not run yet", functions=functions, tokens=tokens)
     return _with_running(graph, running) if running else graph
 
@@ -237,7 +244,7 @@ def plan_view(plan: Plan, room: Room = ROOM) -> GraphView:
     """Look at a plan; hyperparameters may be images, of which so many are shown."""
     structure, missing = structure_of(plan.cg, plan.branches, plan.left_out), frozenset(plan.missing)
     hparams = Hyperparameters(plan.hyperparameters, plan.first_hyperparameters)
-    tokens = token_views(
+    tokens, _ = token_views(
         structure, hparams, lambda name: "missing" if name in missing else "static", room, plan.targets
     )
     functions = tuple(_planned_view(function, plan) for function in structure.functions)
