@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Final
 
@@ -112,7 +113,16 @@ def duration_text(duration_ns: int) -> str:
     >>> duration_text(5_230_000), duration_text(740)
     ('5.23 ms', '740 ns')
     """
-    for limit, unit in ((1e9, "s"), (1e6, "ms"), (1e3, "µs")):
-        if abs(duration_ns) >= limit:
-            return f"{duration_ns / limit:.3g} {unit}"
-    return f"{duration_ns} ns"
+    return _with_unit(duration_ns, {"s": 1e9, "ms": 1e6, "µs": 1e3}, "ns")
+
+
+def memory_text(size: int) -> str:
+    """Return a number of bytes with its unit, to three digits."""
+    return _with_unit(size, {"GB": 1e9, "MB": 1e6, "kB": 1e3}, "B")
+
+
+def _with_unit(value: int, units: Mapping[str, float], smallest: str) -> str:
+    for unit, size in units.items():
+        if abs(value) >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value} {smallest}"

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from epypes.display.previews.model import Floats
 
+# -- charts -----------------------------------------------------------------------------------------------------------
+
 MOST_POINTS: Final = 128
 MOST_LINES: Final = MOST_POINTS // 4
 _BINS: Final = MOST_POINTS // 2
@@ -125,6 +127,8 @@ def _scaled(values: Floats) -> Floats:
 def _pairs(x: Floats, y: Floats) -> tuple[tuple[float, float], ...]:
     return tuple((round(float(a), 4), round(float(b), 4)) for a, b in zip(x, y, strict=True))
 
+
+# -- marks ------------------------------------------------------------------------------------------------------------
 
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
 _OVERSAMPLED: Final = 2

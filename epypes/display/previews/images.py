@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.display.previews.introspection import is_of
+from epypes.display.text import memory_text
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -51,16 +52,13 @@ def one_channel(image: Array) -> Array:
     return image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image
 
 
-def stride_of(image: Array) -> int:
-    """Return the n whose every n-th row and column make a sample; 1 if the image is small enough."""
-    pixels = image.shape[0] * image.shape[1]
-    return math.ceil(math.sqrt(pixels / SAMPLE_PX)) if pixels > EXACT_PX else 1
-
-
 def sampled(image: Array) -> Array:
     """Return an image of at most a million pixels as it is, of a larger one every n-th row and column."""
-    stride = stride_of(image)
-    return image if stride == 1 else image[::stride, ::stride].copy()
+    pixels = image.shape[0] * image.shape[1]
+    if pixels <= EXACT_PX:
+        return image
+    stride = math.ceil(math.sqrt(pixels / SAMPLE_PX))
+    return image[::stride, ::stride].copy()
 
 
 def image_kind(image: Array, sample: Array) -> ImageKind:
@@ -89,6 +87,8 @@ def _has_two_values(image: Array) -> bool:
 
 def _is_labels(image: Array, sample: Array) -> bool:
     """Whether an image of whole numbers is constant by pieces, as those of regions are."""
+    import numpy as np
+
     if image.ndim != 2 or image.dtype.kind not in "iu" or not sample.size:
         return False
     least, largest = int(sample.min()), int(sample.max())
@@ -98,12 +98,8 @@ def _is_labels(image: Array, sample: Array) -> bool:
     if least == largest:
         # One object that fills the image, or none; larger numbers are rather measured.
         return is_wide and largest <= 1
-    return _has_pieces(image, largest) and _has_few_values(sample, largest)
-
-
-def _has_few_values(sample: Array, largest: int) -> bool:
-    import numpy as np
-
+    if not _has_pieces(image, largest):
+        return False
     return largest <= _MOST_DISTINCT or len(np.unique(sample)) <= _MOST_DISTINCT
 
 
@@ -130,6 +126,8 @@ def _has_pieces(image: Array, largest: int) -> bool:
     is_smooth = largest > _FEW_LABELS and by_one > _SMALL_STEPS * differing
     return differing > 0 and not is_smooth and equal >= least_equal * touching
 
+
+# -- display ranges ---------------------------------------------------------------------------------------------------
 
 # Cameras of 10, 12 and 14 bits write into 16.
 _BITS: Final = (8, 10, 12, 14, 16)
@@ -174,24 +172,19 @@ def own_range(image: Array) -> Range | None:
         return _BYTE
     sample = sampled(image)
     if image.dtype.str[1:] == "u2":
-        return _range_of_bits(int(sample.max()))
+        largest = int(sample.max())
+        return (0.0, 2.0 ** next(bits for bits in _BITS if largest < 2**bits) - 1) if largest else None
     finite = sample[np.isfinite(sample)] if image.dtype.kind == "f" else sample
-    return _range_of(float(finite.min()), float(finite.max()), image.dtype.kind == "f") if finite.size else None
-
-
-def _range_of_bits(largest: int) -> Range | None:
-    bits = next(bits for bits in _BITS if largest < 2**bits)
-    return (0.0, 2.0**bits - 1) if largest else None
-
-
-def _range_of(low: float, high: float, is_float: bool) -> Range:
-    if is_float and low >= 0.0 and high <= 1.0:
+    if not finite.size:
+        return None
+    low, high = float(finite.min()), float(finite.max())
+    if image.dtype.kind == "f" and low >= 0.0 and high <= 1.0:
         return _UNIT
-    if low >= 0.0:
-        return low, high
     reach = max(-low, high)
-    return -reach, reach
+    return (low, high) if low >= 0.0 else (-reach, reach)
 
+
+# -- statistics -------------------------------------------------------------------------------------------------------
 
 _FEW: Final = 4_000
 
@@ -268,14 +261,6 @@ def _finite(values: Any) -> tuple[Any, list[str]]:
 
 def _text(value: Any) -> str:
     return f"{value:.6g}" if value.dtype.kind == "f" else str(value)
-
-
-def memory_text(size: int) -> str:
-    """Return a number of bytes with its unit, to three digits."""
-    for limit, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if size >= limit:
-            return f"{size / limit:.3g} {unit}"
-    return f"{size} B"
 
 
 def label_text(sample: Array) -> str:

@@ -11,83 +11,15 @@ from typing import Any, Final
 
 from epypes.display.previews.drawing import bar_chart
 from epypes.display.previews.features import list_sketch
-from epypes.display.previews.images import memory_text, some_of, statistics_text
+from epypes.display.previews.images import some_of, statistics_text
 from epypes.display.previews.introspection import fields_of, is_of, items_in, kind_name, length_of, pairs_in, stored
 from epypes.display.previews.model import Look, Preview, Sketch
 from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items
-from epypes.display.text import cut
+from epypes.display.text import cut, memory_text
 from epypes.wording import counted
 
-_MOST_COLUMNS: Final = 4
-_NAMED: Final = 8
-_ROWS: Final = 3
-_ROW_CHARACTERS: Final = 60
-
-
-# pandas 3 says where a class is imported from, earlier ones where it is defined.
-@built_in("pandas.DataFrame", "pandas.core.frame.DataFrame")
-def _frame(frame: Any, look: Look) -> Preview:
-    names = [_label(name) for name in itertools.islice(frame.columns, _NAMED)]
-    kinds = [str(kind) for kind in itertools.islice(frame.dtypes, _NAMED)]
-    columns = ", ".join(f"{cut(name, 20)} {kind}" for name, kind in zip(names, kinds, strict=True))
-    rows = frame.iloc[:_ROWS, :_MOST_COLUMNS].itertuples(index=False, name=None)
-    return _table(len(frame), frame.shape[1], names, list(rows), f"DataFrame: {columns}")
-
-
-@built_in("pandas.Series", "pandas.core.series.Series")
-def _series(series: Any, look: Look) -> Preview:
-    rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
-    name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
-    more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
-    detail = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
-    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=(*rows, *more))
-
-
-def record_sketch(array: Any) -> Preview:
-    """Look at an array with named fields."""
-    names = list(array.dtype.names)
-    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in array.flat[:_ROWS]]
-    fields = ", ".join(f"{cut(name, 20)} {array.dtype[name]}" for name in names[:_NAMED])
-    return _table(array.size, len(names), names, rows, f"array of {memory_text(array.nbytes)}: {fields}")
-
-
-def is_dict_list(value: Sequence[Any]) -> bool:
-    """Whether a list is a table: a few dicts of the same texts as keys, as far as its first items show."""
-    first = value[0] if len(value) else None
-    if type(first) is not dict or not first or not all(type(key) is str for key in first):
-        return False
-    return all(type(row) is dict and row.keys() == first.keys() for row in value[:_NAMED])
-
-
-def dict_list_sketch(value: Sequence[dict[str, Any]]) -> Preview:
-    """Look at a list of dicts of the same keys."""
-    names = list(value[0])
-    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in value[:_ROWS]]
-    return _table(len(value), len(names), names, rows, f"list of {len(value)} dicts: {', '.join(names[:_NAMED])}")
-
-
-def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], detail: str) -> Preview:
-    text = f"{counted(count, 'row')} x {columns} columns"
-    more = ", ..." if columns > _NAMED else ""
-    lines = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    shown = ("  ".join(map(str.ljust, line, widths)).rstrip()[:_ROW_CHARACTERS] for line in lines)
-    return Preview(text, cut(f"{detail}{more}; {text}", 280), rows=tuple(shown))
-
-
-def _cell(value: Any) -> str:
-    if is_of(value, "numpy", "generic"):
-        value = value.item()
-    return cut(f"{value:.4g}" if type(value) is float else _label(value), 12)
-
-
-def _label(value: Any) -> str:
-    return value if type(value) is str else short_repr(value)
-
-
 _MOST_ROWS: Final = 4
-_LOOKED_AT: Final = 200
 # A tuple that is so short is written out on the vertex: the sides of a kernel, a size.
 _PLAIN_TUPLE: Final = 4
 _NUMBERS: Final = (int, float, bool)
@@ -163,22 +95,6 @@ def _dict(value: Any, look: Look) -> Preview:
     return Preview(f"{_name(value)} of {count}", cut(f"{_name(value)} of {count}: {keys}", 200), rows=rows)
 
 
-def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
-    """Look at counts and edges as ``np.histogram`` returns them."""
-    counts, edges = value
-    text = f"{len(counts)} bins"
-    detail = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
-    return Sketch(Preview(text, detail), lambda most_bytes: bar_chart(counts))
-
-
-def is_histogram(value: Any) -> bool:
-    """Whether a value is what ``np.histogram`` returns."""
-    if len(value) != 2 or not all(is_of(part, "numpy", "ndarray") and part.ndim == 1 for part in value):
-        return False
-    counts, edges = value
-    return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
-
-
 @built_in(object)
 def _object(value: Any, look: Look) -> Preview:
     fields = fields_of(value)
@@ -207,3 +123,88 @@ def _item_rows(mapping: Any) -> Iterator[str]:
 
 def _name(value: Any) -> str:
     return cut(kind_name(type(value)), 20)
+
+
+def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
+    """Look at counts and edges as ``np.histogram`` returns them."""
+    counts, edges = value
+    text = f"{len(counts)} bins"
+    detail = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
+    return Sketch(Preview(text, detail), lambda most_bytes: bar_chart(counts))
+
+
+def is_histogram(value: Any) -> bool:
+    """Whether a value is what ``np.histogram`` returns."""
+    if len(value) != 2 or not all(is_of(part, "numpy", "ndarray") and part.ndim == 1 for part in value):
+        return False
+    counts, edges = value
+    return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
+
+
+# -- tables -----------------------------------------------------------------------------------------------------------
+
+_MOST_COLUMNS: Final = 4
+_NAMED: Final = 8
+_ROWS: Final = 3
+_ROW_CHARACTERS: Final = 60
+
+
+# pandas 3 says where a class is imported from, earlier ones where it is defined.
+@built_in("pandas.DataFrame", "pandas.core.frame.DataFrame")
+def _frame(frame: Any, look: Look) -> Preview:
+    names = [_label(name) for name in itertools.islice(frame.columns, _NAMED)]
+    kinds = [str(kind) for kind in itertools.islice(frame.dtypes, _NAMED)]
+    columns = ", ".join(f"{cut(name, 20)} {kind}" for name, kind in zip(names, kinds, strict=True))
+    rows = frame.iloc[:_ROWS, :_MOST_COLUMNS].itertuples(index=False, name=None)
+    return _table(len(frame), frame.shape[1], names, list(rows), f"DataFrame: {columns}")
+
+
+@built_in("pandas.Series", "pandas.core.series.Series")
+def _series(series: Any, look: Look) -> Preview:
+    rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
+    name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
+    more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
+    detail = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
+    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=(*rows, *more))
+
+
+def record_sketch(array: Any) -> Preview:
+    """Look at an array with named fields."""
+    names = list(array.dtype.names)
+    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in array.flat[:_ROWS]]
+    fields = ", ".join(f"{cut(name, 20)} {array.dtype[name]}" for name in names[:_NAMED])
+    return _table(array.size, len(names), names, rows, f"array of {memory_text(array.nbytes)}: {fields}")
+
+
+def is_dict_list(value: Sequence[Any]) -> bool:
+    """Whether a list is a table: a few dicts of the same texts as keys, as far as its first items show."""
+    first = value[0] if len(value) else None
+    if type(first) is not dict or not first or not all(type(key) is str for key in first):
+        return False
+    return all(type(row) is dict and row.keys() == first.keys() for row in value[:_NAMED])
+
+
+def dict_list_sketch(value: Sequence[dict[str, Any]]) -> Preview:
+    """Look at a list of dicts of the same keys."""
+    names = list(value[0])
+    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in value[:_ROWS]]
+    return _table(len(value), len(names), names, rows, f"list of {len(value)} dicts: {', '.join(names[:_NAMED])}")
+
+
+def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], detail: str) -> Preview:
+    text = f"{counted(count, 'row')} x {columns} columns"
+    more = ", ..." if columns > _NAMED else ""
+    lines = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    shown = ("  ".join(map(str.ljust, line, widths)).rstrip()[:_ROW_CHARACTERS] for line in lines)
+    return Preview(text, cut(f"{detail}{more}; {text}", 280), rows=tuple(shown))
+
+
+def _cell(value: Any) -> str:
+    if is_of(value, "numpy", "generic"):
+        value = value.item()
+    return cut(f"{value:.4g}" if type(value) is float else _label(value), 12)
+
+
+def _label(value: Any) -> str:
+    return value if type(value) is str else short_repr(value)
