@@ -1,4 +1,4 @@
-"""What does a look at a graph cost?"""
+"""Benchmarks of looking at graphs."""
 
 from __future__ import annotations
 

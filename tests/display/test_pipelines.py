@@ -1,4 +1,4 @@
-"""Do pipelines show what events pass, as it is at the moment?"""
+"""Pipelines show what events pass, as it is at the moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is shown of values of each kind, and does it stay small and never raise?"""
+"""Previews of values of each kind stay small and never raise."""
 
 from __future__ import annotations
 

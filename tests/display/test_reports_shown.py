@@ -1,4 +1,4 @@
-"""Do the times of one run, and of many, show as bars, as tables and as printed text?"""
+"""The times of one run, and of many, show as bars, as tables and as printed text."""
 
 from __future__ import annotations
 

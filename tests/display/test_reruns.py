@@ -1,4 +1,4 @@
-"""Pictures of reruns: only what changed is looked at and painted again, and every picture is what a first one would be."""
+"""Pictures of reruns: what changed alone is looked at and painted again; each is the same as a first one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does a picture tell in which state everything is, also while functions run?"""
+"""A picture shows in which state everything is, also while functions run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which tokens get a thumbnail, how are they painted, and does a vertex keep its size?"""
+"""The tokens that get a thumbnail, how they are painted, and the size of their vertices."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def register_preview(kind: type | str, function: None = None) -> Callable[[_Func
 @overload
 def register_preview(kind: type | str, function: _Function) -> _Function: ...
 def register_preview(kind: type | str, function: Callable[[Any], Any] | None = None) -> Any:
-    """Say how values of a type are shown in pictures of graphs and runs.
+    """Register how values of a type are shown in pictures of graphs and runs.
 
     Parameters
     ----------
