@@ -89,7 +89,7 @@ class _Kept:
 
     def __init__(self) -> None:
         self.revision = -1
-        self.previews: dict[str, ValuePreview] = {}
+        self.previews: dict[tuple[str, bool], ValuePreview] = {}
         self.ranges: dict[tuple[str, str], Range] = {}
 
 
@@ -102,8 +102,8 @@ def _kept_of(program: Program) -> _Kept:
         return _kept.setdefault(program, _Kept())
 
 
-def kept_previews(program: Program) -> dict[str, ValuePreview]:
-    """Return the previews of a program's tokens by name, to be replaced by newer ones."""
+def kept_previews(program: Program) -> dict[tuple[str, bool], ValuePreview]:
+    """Return the previews of a program's tokens by name, and by whether they are of a hyperparameter's first value."""
     kept = _kept_of(program)
     if kept.revision != users_revision():
         # A user's function may look at these values now.

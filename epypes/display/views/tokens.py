@@ -32,15 +32,16 @@ class _Found(NamedTuple):
 class _Known(NamedTuple):
     """The previews that are kept of a program's tokens; in a nested look, each value is named only."""
 
-    kept: dict[str, ValuePreview]
+    kept: dict[tuple[str, bool], ValuePreview]
     is_nested: bool
 
-    def find(self, name: str, value: Any, look: Look) -> _Found:
-        shown = self.kept.get(name)
+    def find(self, name: str, value: Any, look: Look, *, is_first: bool = False) -> _Found:
+        key = name, is_first
+        shown = self.kept.get(key)
         if shown is None or self.is_nested or not shown.is_of(value, look):
             shown = ValuePreview(value, look, self.is_nested)
             if shown.is_constant:
-                self.kept[name] = shown
+                self.kept[key] = shown
         return _Found(shown, value, look)
 
 
@@ -54,7 +55,7 @@ class Room(NamedTuple):
 ROOM: Final = Room()
 
 
-class Hyperparameters(NamedTuple):
+class HyperparameterValues(NamedTuple):
     """The values of hyperparameters by token, and those that they had first."""
 
     values: Mapping[str, Any]
@@ -63,7 +64,7 @@ class Hyperparameters(NamedTuple):
 
 def token_views(
     structure: GraphView,
-    hparams: Hyperparameters,
+    hparams: HyperparameterValues,
     state_of: Callable[[str], TokenState],
     room: Room,
     targets: Collection[str] = (),
@@ -135,7 +136,7 @@ def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]
     return rank
 
 
-def _first_texts(structure: GraphView, hparams: Hyperparameters, known: _Known) -> dict[str, str]:
+def _first_texts(structure: GraphView, hparams: HyperparameterValues, known: _Known) -> dict[str, str]:
     """Return the texts of the first values of hyperparameters that have another one now."""
     texts = {}
     for token in structure.tokens:
@@ -143,7 +144,8 @@ def _first_texts(structure: GraphView, hparams: Hyperparameters, known: _Known) 
         if name in hparams.first and name in hparams.values:
             first, value = hparams.first[name], hparams.values[name]
             if first is not value and not is_same_value(first, value):
-                texts[name] = known.find(f"first {name}", first, Look(token.order)).shown.brief.text
+                shown = known.find(name, first, Look(token.order), is_first=True).shown
+                texts[name], shown.sketch = shown.brief.text, None
     return texts
 
 

@@ -22,7 +22,7 @@ from epypes.display.text import (
 from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView, TokenState
 from epypes.display.views.groups import collapsed, groups_of, outside_tokens, twice_seen
 from epypes.display.views.structure import structure_of
-from epypes.display.views.tokens import ROOM, Hyperparameters, Room, token_views
+from epypes.display.views.tokens import ROOM, HyperparameterValues, Room, token_views
 from epypes.errors import UnknownName, run_call
 from epypes.graph import CompGraph
 from epypes.graph.renaming import names_of
@@ -128,12 +128,12 @@ def _whole(shown: Shown, room: Room, closed: Mapping[str, Sequence[str]]) -> Gra
     """Look at all functions; thumbnails that are in closed groups are dropped first."""
     if isinstance(shown, CompGraph):
         # Tokens with a default are shown as the hyperparameters that a runner makes of them.
-        structure, hparams = structure_of(shown, {}, ()), Hyperparameters(shown.defaults)
+        structure, hparams = structure_of(shown, {}, ()), HyperparameterValues(shown.defaults)
         return replace(structure, tokens=token_views(structure, hparams, lambda name: "static", room)[0])
     if isinstance(shown, Plan):
         return plan_view(shown, room)
     if isinstance(shown, Run):
-        hparams = Hyperparameters(shown.hyperparameters, shown.first_hyperparameters)
+        hparams = HyperparameterValues(shown.hyperparameters, shown.first_hyperparameters)
         return _run_view(shown, _run_structure(shown), hparams, frozenset(), room, closed)
     if isinstance(shown, CompGraphRunner):
         return _runner_view(shown, room, closed)
@@ -160,7 +160,7 @@ def _run_structure(run: Run) -> GraphView:
 def _run_view(
     run: Run,
     structure: GraphView,
-    hparams: Hyperparameters,
+    hparams: HyperparameterValues,
     stale: frozenset[str],
     room: Room,
     closed: Mapping[str, Sequence[str]],
@@ -213,7 +213,7 @@ def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Seque
     # First, so that what ends meanwhile shows as running, not as never run.
     running, last, plan = runner.running, runner.last, runner.plan()
     structure = structure_of(plan.cg, plan.branches, plan.left_out)
-    hparams = Hyperparameters(plan.hyperparameters, plan.first_hyperparameters)
+    hparams = HyperparameterValues(plan.hyperparameters, plan.first_hyperparameters)
     if last is not None:
         graph = _run_view(last, structure, hparams, frozenset(plan.order), room, closed)
     else:
@@ -243,7 +243,7 @@ def _with_running(graph: GraphView, running: Sequence[str]) -> GraphView:
 def plan_view(plan: Plan, room: Room = ROOM) -> GraphView:
     """Look at a plan; hyperparameters may be images, of which so many are shown."""
     structure, missing = structure_of(plan.cg, plan.branches, plan.left_out), frozenset(plan.missing)
-    hparams = Hyperparameters(plan.hyperparameters, plan.first_hyperparameters)
+    hparams = HyperparameterValues(plan.hyperparameters, plan.first_hyperparameters)
     tokens, _ = token_views(
         structure, hparams, lambda name: "missing" if name in missing else "static", room, plan.targets
     )
