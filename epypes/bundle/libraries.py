@@ -226,7 +226,10 @@ def _attributes(owner: Any, home: str, prefix: str = "") -> Iterator[tuple[str, 
 
 def _described(value: Any) -> str:
     """Describe a value by a short text that is the same in each process."""
-    text = _text(value)
+    try:
+        text = _text(value)
+    except Exception:  # whatever an object raises that is made only to be imported
+        return "unknown"
     if len(text) <= _MOST_TEXT or isinstance(value, _ATOMS):
         return text if len(text) <= _MOST_TEXT else _digest(text.encode("utf-8", "surrogatepass"))
     head = text.partition(" ")[0]
@@ -242,9 +245,13 @@ def _text(value: Any) -> str:
     if isinstance(value, type):
         return f"{value.__module__}.{value.__qualname__}"
     if kind is types.FunctionType:
-        # Without objects such as sys.stdout.
+        # Without objects such as sys.stdout; of functions the name, since they may refer to each other.
         given = [*enumerate(value.__defaults__ or ()), *sorted((value.__kwdefaults__ or {}).items())]
-        defaults = [one for one in given if callable(one[1]) or isinstance(one[1], (*_ATOMS, tuple, frozenset))]
+        defaults = [
+            (key, _name(default) if callable(default) else default)
+            for key, default in given
+            if callable(default) or isinstance(default, (*_ATOMS, tuple, frozenset))
+        ]
         home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
         return f"{home} {_code_text(value.__code__)} {_text(tuple(defaults))}"
     if inner := _INNER.get(kind) or (("_implementation",) if kind.__name__ == "_ArrayFunctionDispatcher" else ()):
