@@ -2,7 +2,8 @@
 
 The rooms, from the bottom up; imports point downwards only (checked by ``lint-imports``):
 
-- ``errors``: every error EPypes raises; ``optional``: which extra brings a package that is missing
+- ``errors``: every error EPypes raises; ``optional``: which extra brings a package that is missing;
+  ``rich_display``: the registry that objects ask for their picture
 - ``annotations``: what a function's annotations say, once evaluated
 - ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images
 - ``graph``: what is connected to what

@@ -18,9 +18,8 @@ from typing import Final
 from epypes.batch.grid import identity
 from epypes.batch.results import Outcome, short_text
 from epypes.batch.thumbnails import Thumbnail, data_uri, smaller
-from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
-from epypes.display.markup import content, escape, fitted, size
 from epypes.display.previews.short import reason
+from epypes.display.text import CHARACTERS, THUMBNAIL_CHARACTERS, content, escape, fitted, size
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.wording import counted

@@ -29,7 +29,7 @@ from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
-from epypes.display.markup import content, cut, cut_name, escape
+from epypes.display.text import content, cut, cut_name, escape
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner

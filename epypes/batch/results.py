@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any, Final, overload
 
 from epypes.batch.items import Item
 from epypes.batch.thumbnails import Thumbnail, data_uri
-from epypes.display.durations import duration_text
-from epypes.display.markup import content, escape, fitted
+from epypes.display.previews.model import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import float_text
-from epypes.display.previews.shown import Look
+from epypes.display.text import content, duration_text, escape, fitted
 from epypes.errors import ImageFileError, ScaleError
 from epypes.graph import CompGraph
 from epypes.optional import optional_import

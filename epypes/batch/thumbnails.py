@@ -12,15 +12,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
+from epypes.display.paint.vertices import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.imagekinds import image_kind, is_image, sampled
+from epypes.display.previews.encoding import encode_small
+from epypes.display.previews.images import display_range, image_kind, is_image, sampled, sole_value
+from epypes.display.previews.model import THUMBNAIL_PX, Look, Sketch
 from epypes.display.previews.preview import finished, looked_closer, sketch
-from epypes.display.previews.ranges import display_range, sole_value
-from epypes.display.previews.raster import THUMBNAIL_PX, encode_small
 from epypes.display.previews.short import float_text
-from epypes.display.previews.shown import Look, Sketch
-from epypes.display.views.backdrops import RunSurroundings
+from epypes.display.views.surroundings import RunSurroundings
 from epypes.graph import CompGraph, colour_order
 from epypes.images import Order
 from epypes.optional import optional_import

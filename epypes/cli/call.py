@@ -80,7 +80,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
 
 def _print_answer(title: str, answer: Answer) -> None:
     """Print the times of a service's answer as a table."""
-    from epypes.display.durations import duration_text
+    from epypes.display.text import duration_text
 
     totals = {"graph overhead": answer.overhead_ns, "run in all": answer.total_ns, "round trip": answer.round_trip_ns}
     functions = [(f"function {name}", duration_text(time)) for name, time in answer.timings_ns.items()]

@@ -1,18 +1,18 @@
 """How a graph, a run and a value look, as static SVG, HTML and text."""
 
-from epypes.display.mime import mimebundle, to_svg
-from epypes.display.previews.imagekinds import is_image
-from epypes.display.previews.marks import scene_picture
-from epypes.display.previews.preview import Chart, Preview
-from epypes.display.previews.ranges import reset_display_ranges
-from epypes.display.previews.raster import Picture, encode_image
+from epypes.display.formatters import Figure, mimebundle, show, to_svg, to_text
+from epypes.display.previews.drawing import scene_picture
+from epypes.display.previews.encoding import encode_image
+from epypes.display.previews.images import is_image
+from epypes.display.previews.kept import reset_display_ranges
+from epypes.display.previews.model import Backdrop, Chart, Marks, Most, Picture, Preview, Scene
 from epypes.display.previews.registry import register_preview
-from epypes.display.previews.shown import Backdrop, Marks, Most, Scene
-from epypes.display.printed import to_text
-from epypes.display.show import Figure, show
 from epypes.display.views.graphview import GraphView
-from epypes.display.views.scenes import scene_of
+from epypes.display.views.surroundings import scene_of
 from epypes.display.views.view import view
+from epypes.rich_display import Formatters, register
+
+register(Formatters(mimebundle, to_text))
 
 __all__ = [
     "Backdrop",

@@ -18,6 +18,7 @@ from epypes.graph.token_annotations import read_contracts
 from epypes.graph.validation import Default, GraphParts, find_problems, read_io
 from epypes.images import Contracts
 from epypes.optional import optional_import
+from epypes.rich_display import mimebundle
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -280,8 +281,6 @@ class CompGraph:
         return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

@@ -13,6 +13,7 @@ from epypes.errors import HyperparameterError, PayloadError
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
 from epypes.pipeline.node import Node, NodeBasedCompGraph
+from epypes.rich_display import mimebundle
 from epypes.run import CompGraphRunner, Run
 from epypes.wording import counted
 
@@ -248,8 +249,6 @@ class Pipeline(Node, Mapping[str, Any]):
         return [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

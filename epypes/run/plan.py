@@ -15,6 +15,7 @@ from typing import Any
 
 from epypes.errors import PayloadError, PlaceholderNeeded, UnknownName, run_call
 from epypes.graph import CompGraph
+from epypes.rich_display import mimebundle, to_text
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, TokenManager
@@ -70,13 +71,9 @@ class Plan:
         return f"<Plan: {counted(count, 'function')} to run, {len(self.reused)} reused{missing}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
-
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

@@ -125,7 +125,7 @@ class Run(Mapping[str, Any]):
         return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
+        from epypes.rich_display import mimebundle
 
         return mimebundle(self)
 

@@ -12,6 +12,7 @@ from weakref import ref
 
 from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
+from epypes.rich_display import mimebundle
 from epypes.run.execute import CompiledRun, Executor
 from epypes.run.failure import failure_of
 from epypes.run.guard import COPIERS, lend, require_reusable
@@ -553,8 +554,6 @@ class CompGraphRunner(Mapping[str, Any]):
         return f"<CompGraphRunner: {functions}{old}, {counted(frozen, 'hyperparameter')}; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

@@ -17,6 +17,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, overload
 
 from epypes.optional import optional_import
+from epypes.rich_display import mimebundle, to_text
 from epypes.run.program import Program
 from epypes.wording import counted
 
@@ -178,12 +179,12 @@ class RunReport:
         return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{', 1 failed' * failed}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
+        from epypes.rich_display import to_text
 
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
+        from epypes.rich_display import mimebundle
 
         return mimebundle(self)
 
@@ -229,12 +230,12 @@ class Reports(Sequence[RunReport]):
         return f"<Reports of {counted(len(self), 'run')}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
+        from epypes.rich_display import to_text
 
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
+        from epypes.rich_display import mimebundle
 
         return mimebundle(self)
 
@@ -383,13 +384,9 @@ class TimingSummary:
         return f"<TimingSummary: {counted(self.runs, 'run')}, {counted(functions, 'function')}>"
 
     def __str__(self) -> str:
-        from epypes.display import to_text
-
         return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display import mimebundle
-
         return mimebundle(self)
 
 

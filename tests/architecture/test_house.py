@@ -40,6 +40,16 @@ def test_graphs_and_runners_need_the_standard_library_only():
     assert not {name.partition(".")[0] for name in done.stdout.split()} & (HEAVY - {"logging"})
 
 
+def test_display_is_loaded_when_something_is_shown_first():
+    code = (
+        "import sys; import epypes as ep\n"
+        "r = ep.CompGraphRunner(ep.CompGraph({'f': lambda x: x + 1}, {'f': ('x', 'y')}))\n"
+        "r.run(x=1), repr(r); assert 'epypes.display' not in sys.modules\n"
+        "assert 'image/svg+xml' in r._repr_mimebundle_() and 'ran' in str(r.last.report)"
+    )
+    subprocess.run([sys.executable, "-I", "-c", code], check=True)
+
+
 def test_every_public_name_can_be_had_and_all_is_sorted():
     assert epypes.__all__ == sorted(epypes.__all__)
     for name in epypes.__all__:

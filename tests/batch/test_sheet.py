@@ -14,7 +14,7 @@ import epypes as ep
 from epypes.batch.contact_sheet import Tile
 from epypes.batch.results import short_text
 from epypes.batch.thumbnails import Thumbnail
-from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
+from epypes.display.text import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName
 
 

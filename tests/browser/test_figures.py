@@ -478,7 +478,7 @@ def many_states(photo: np.ndarray) -> str:
 
 def _redefined(run: ep.Run) -> str:
     graph = view(run)
-    graph = replace(graph, functions=tuple(replace(each, is_redefined=True) for each in graph.functions))
+    graph = replace(graph, functions=tuple(each._replace(is_redefined=True) for each in graph.functions))
     svg = paint_svg(graph)
     return "".join(paint_graph(graph, svg))
 

@@ -29,7 +29,7 @@ WATCH = """() => {
 }"""
 KERNEL_DIGEST = """
 import hashlib
-from epypes.display.previews.raster import encode_image
+from epypes.display.previews.encoding import encode_image
 panel.wait(60)
 print(hashlib.sha256(encode_image(panel.result[panel.token], max_side_px=1400).data).hexdigest())
 """

@@ -1,4 +1,4 @@
-"""Are features drawn over the images that they were found in?"""
+"""Features are drawn over the images that they were found in."""
 
 from __future__ import annotations
 

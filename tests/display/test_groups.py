@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.paint.svg import paint_svg
-from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, TokenView
+from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, TokenView, from_json, to_json
 from epypes.display.views.groups import collapsed, groups_of
-from epypes.display.views.jsonview import from_json, to_json
 
 SVG = "{http://www.w3.org/2000/svg}"
 IMAGE = np.tile(np.arange(64, dtype=np.uint8), (64, 1))

@@ -8,11 +8,10 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg
 from epypes.display.layout.blocks import fold
-from epypes.display.layout.engine import routed_layout
 from epypes.display.layout.geometry import Box, Layout
-from epypes.display.layout.place import lay_out
-from epypes.display.layout.rows import ranks
-from epypes.display.paint.edges import paint_edges
+from epypes.display.layout.graphviz import routed_layout
+from epypes.display.layout.placement import lay_out, ranks
+from epypes.display.paint.svg import paint_edges
 from epypes.display.views.graphview import EdgeView
 
 BOX = Box("box", 60.0, 30.0)

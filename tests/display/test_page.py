@@ -20,7 +20,7 @@ from epypes.display import mimebundle, to_svg, view
 from epypes.display.paint.page import paint_graph, paint_page
 from epypes.display.paint.svg import paint_svg
 from epypes.display.views.graphview import GraphView
-from epypes.display.views.source import LINE_CHARACTERS, SIGNATURE_CHARACTERS, SOURCE_LINES, signature_and_source
+from epypes.display.views.structure import LINE_CHARACTERS, SIGNATURE_CHARACTERS, SOURCE_LINES, signature_and_source
 from tests.pictures import assert_same_picture
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -289,8 +289,8 @@ def test_sources_that_do_not_fit_are_left_out_the_least_relevant_first():
     runner = with_sources(count)
     graph = view(runner.run(t0=1))
     shares = (0.0, 0.1, 0.5, 0.2, *(0.01,) * (count - 4))
-    functions = [replace(each, share=share) for each, share in zip(graph.functions, shares, strict=True)]
-    functions[-1] = replace(functions[-1], state="failed", share=0.0)
+    functions = [each._replace(share=share) for each, share in zip(graph.functions, shares, strict=True)]
+    functions[-1] = functions[-1]._replace(state="failed", share=0.0)
     graph = replace(graph, functions=tuple(functions))
     svg = paint_svg(graph)
     html = paint_page(*paint_graph(graph, svg))

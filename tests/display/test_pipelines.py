@@ -1,4 +1,4 @@
-"""Do pipelines show what events pass, as it is at the moment?"""
+"""Pipelines show what events pass, as it is at the moment."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.place import lay_out
+from epypes.display.layout.placement import lay_out
 from epypes.display.paint.svg import alt_text, paint_svg
-from epypes.display.paint.text import paint_text
+from epypes.display.paint.tables import paint_text
 from epypes.pipeline.reactive import queue_stage
 from tests.display.test_display import SVG, texts, vertices
 from tests.display.test_states import TIMEOUT_S, Gate
@@ -300,7 +300,7 @@ def test_a_pipeline_of_ones_own_may_add_stages():
 
 def test_a_pipeline_that_can_not_tell_its_stages_is_shown_without():
     shown = mimebundle(Broken("broken", graph(), queue.Queue(), queue.Queue(), f_in, f_out))
-    assert "its stages can't be told: RuntimeError: not today" in unescape(shown["text/html"])
+    assert "its stages can't be read: RuntimeError: not today" in unescape(shown["text/html"])
     assert "function-f" in vertices(shown["image/svg+xml"])
 
 

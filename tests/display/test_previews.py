@@ -1,4 +1,4 @@
-"""What is shown of values of each kind, and does it stay small and never raise?"""
+"""Previews of values of each kind stay small and never raise."""
 
 from __future__ import annotations
 
@@ -747,22 +747,27 @@ def picture(**changes: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"media_type": 'image/png"/><script>alert(1)</script>'}, {"media_type": "text/html"}, {"media_type": b"image/png"},
-        {"media_type": type("Media", (str,), {})("image/jpeg")}, {"data": b"<script>alert(1)</script>"}, {"data": "text"},
-        {"data": [1, 2]}, {"width": 0}, {"height": -5}, {"width": float("nan")}, {"width": "40"}, {"media_type": "image/png"},
-        {"data": encode_image(red_image(40)).data[:-200]}, {"width": True}, {"data": bytearray(encode_image(red_image(40)).data)},
-    ],
-    ids=range(15),
-)  # fmt: skip
-def test_a_picture_that_is_not_what_it_says_is_not_painted(changes):
-    value = registered(ep.Preview("mine", picture=picture(**changes)))
+    "data",
+    [b"<script>alert(1)</script>", "text", [1, 2], b"", encode_image(red_image(40)).data[:-200]],
+    ids=range(5),
+)
+def test_a_picture_whose_bytes_are_none_is_not_painted(data):
+    value = registered(ep.Preview("mine", picture=picture(data=data)))
     shown = preview(value)
     assert shown.picture is None
     assert (shown.text, "no picture: " in shown.detail) == ("mine", True)
     painted = mimebundle(ep.CompGraphRunner(ep.CompGraph({"f": lambda: value}, {"f": ((), "y")})).run())["text/html"]
     assert "<script>alert" not in painted
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"media_type": 'image/png"/><script>alert(1)</script>'}, {"media_type": "text/html"}, {"media_type": b"image/png"},
+     {"width": 0}, {"height": -5}, {"width": float("nan")}, {"width": "40"}],
+    ids=range(7),
+)  # fmt: skip
+def test_the_bytes_of_a_picture_decide_what_it_is(changes):
+    assert preview(registered(ep.Preview("mine", picture=picture(**changes)))).picture == encode_image(red_image(40))
 
 
 def test_a_picture_has_the_size_that_its_file_has():

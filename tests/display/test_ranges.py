@@ -1,4 +1,4 @@
-"""Which values are black and white, in the picture of a graph and on a panel alike?"""
+"""Black and white are the same values in the picture of a graph and on a panel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do the times of one run, and of many, show as bars, as tables and as printed text?"""
+"""The times of one run, and of many, show as bars, as tables and as printed text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle
-from epypes.display.views.times import report_times
+from epypes.display.paint.times import report_times
 from epypes.run.program import Program
 from epypes.run.timing import Reports
 from tests.display.test_display import SVG, texts

@@ -10,11 +10,10 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.place import lay_out
+from epypes.display.layout.placement import lay_out
 from epypes.display.paint.svg import paint_svg
 from epypes.display.previews.preview import Chart, Preview
-from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, StageView, TokenView
-from epypes.display.views.jsonview import from_json, to_json
+from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, StageView, TokenView, from_json, to_json
 from epypes.errors import UnknownName
 
 SVG = "{http://www.w3.org/2000/svg}"

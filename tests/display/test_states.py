@@ -1,4 +1,4 @@
-"""Does a picture tell in which state everything is, also while functions run?"""
+"""A picture shows in which state everything is, also while functions run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.place import lay_out
+from epypes.display.layout.placement import lay_out
 from epypes.run import execute
 from tests.display.test_display import SVG, texts, vertices
 

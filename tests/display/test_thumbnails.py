@@ -1,4 +1,4 @@
-"""Which tokens get a thumbnail, how are they painted, and does a vertex keep its size?"""
+"""The tokens that get a thumbnail, how they are painted, and the size of their vertices."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.place import lay_out
-from epypes.display.limits import THUMBNAIL_CHARACTERS
-from epypes.display.views.tokens import Room, with_run_values
+from epypes.display.layout.placement import lay_out
+from epypes.display.text import THUMBNAIL_CHARACTERS
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -63,11 +62,10 @@ def test_what_has_no_thumbnail_still_tells_its_range():
 
 def test_so_many_can_be_asked_for():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
-    every = view(run).tokens
     for asked, expected in ((0, 0), (3, 3), (1000, 37)):
-        tokens, left_out = with_run_values(every, run, {}, Room(asked))
-        assert sum(token.preview.picture is not None for token in tokens) == expected
-        assert left_out == 61 - expected
+        graph = view(run, thumbnails=asked)
+        assert sum(token.preview.picture is not None for token in graph.tokens) == expected
+        assert f"; {61 - expected} thumbnails left out" in graph.caption
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from epypes.bundle.settings import encode_value
 from epypes.catalog import plain
-from epypes.display.views.jsonview import to_json
+from epypes.display.views.graphview import to_json
 from epypes.display.views.view import view
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError
 from epypes.service.http.server import HttpServer

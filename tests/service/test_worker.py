@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from epypes.bundle.manifest import write_manifest
-from epypes.display.views.jsonview import from_json
+from epypes.display.views.graphview import from_json
 from epypes.service.frame_socket import WorkerMessage
 from epypes.service.packing import MARK, unpack
 from epypes.wire import Envelope, decode

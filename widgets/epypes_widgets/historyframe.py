@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas as pd
 
 from epypes.display import Picture
-from epypes.display.markup import escape
+from epypes.display.text import escape
 
 if TYPE_CHECKING:
     from epypes_widgets.history import Entry

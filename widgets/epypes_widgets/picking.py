@@ -14,7 +14,7 @@ import anywidget
 from epypes.batch.contact_sheet import Block, Sheet, Tile, sheet_page, shown_tokens
 from epypes.batch.grid import identity
 from epypes.batch.mapping import SweepResult
-from epypes.display.markup import cut
+from epypes.display.text import cut
 from epypes.errors import EpypesError
 from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.still import Still

@@ -10,9 +10,9 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
-from epypes.display.markup import content, cut, escape, fitted, written_length
+from epypes.display.previews.model import Look
 from epypes.display.previews.preview import sketch
-from epypes.display.previews.shown import Look
+from epypes.display.text import content, cut, escape, fitted, written_length
 from epypes.errors import NotComputed
 from epypes.graph import colour_order
 from epypes.run import Run

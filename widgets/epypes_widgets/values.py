@@ -7,8 +7,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from epypes.display.previews.model import Look
 from epypes.display.previews.preview import sketch
-from epypes.display.previews.shown import Look
 from epypes.run.guard import is_array
 
 _CONTAINERS: Final = (tuple, list, dict)

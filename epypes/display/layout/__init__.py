@@ -1,1 +1,1 @@
-"""Where does everything go?"""
+"""The place of vertices and the way of edges, by Graphviz where it can."""

@@ -1,4 +1,4 @@
-"""Which vertices stand together in a block, and where in it?
+"""Blocks: many sources, or sinks, of the same functions, which stand together.
 
 A function with nine hyperparameters would have them all in one row, so wide that a page shrinks the picture until
 nothing can be read. Sources that lead to exactly the same vertices stand in a block instead: a row whose edges meet
@@ -15,7 +15,7 @@ from typing import Final
 
 from epypes.display.layout.geometry import Box, Edge, Layout, Point
 
-# The edges of so many are still told apart.
+# The edges of so many can still be followed.
 _MOST_APART: Final = 4
 # What fits into this width stands in one row.
 _ROW_PX: Final = 500.0

@@ -1,9 +1,9 @@
-"""What does a layout consist of?"""
+"""What a layout is made from and consists of."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Direction = Literal["down", "right"]
 Shape = Literal["box", "ellipse", "hexagon"]
@@ -11,8 +11,7 @@ Point = tuple[float, float]
 Edge = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class Box(NamedTuple):
     """A vertex to be placed: its shape and size, in pixels."""
 
     shape: Shape
@@ -38,3 +37,7 @@ class Layout:
     height: float
     centres: tuple[Point, ...]
     splines: tuple[tuple[Point, ...], ...]
+
+    def __hash__(self) -> int:
+        # Of a kept layout. To hash thousands of numbers takes longer than to paint them.
+        return id(self)

@@ -1,1 +1,1 @@
-"""How is a view painted, as SVG, as tables and as text?"""
+"""A view as SVG, as a page, as tables and as text."""

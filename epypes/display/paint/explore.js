@@ -1,4 +1,4 @@
-// What can be done with the pictures of graphs on a page, without a kernel?
+// Exploring the pictures of graphs on a page, without a kernel.
 //
 // Hovering or focusing a vertex shows its thumbnail larger and what is known of it; choosing one (click, Enter, Space)
 // marks its ancestors and descendants and tells of it below the picture; Escape ends both. All listeners are the

@@ -1,4 +1,4 @@
-"""What does a page get besides the picture: how it is explored, its twin for screen readers, its functions' sources?
+"""A picture in a page: how it is explored, its twin for screen readers, its functions' sources.
 
 The picture is an ``<img>`` of the SVG, which the script replaces by the SVG itself: a page that does not trust a
 notebook strips scripts and would strip inline SVG down to its loose words, but keeps the image. Where the script runs,
@@ -9,16 +9,25 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import cache, lru_cache
 from importlib import resources
 from typing import Any, Final
 
-from epypes.display.limits import CHARACTERS, CHARACTERS_OF_A_VERTEX, THUMBNAIL_CHARACTERS
-from epypes.display.markup import QUOTE, content, cut, escape, fitted, size
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
+from epypes.display.text import (
+    CHARACTERS,
+    CHARACTERS_OF_A_VERTEX,
+    QUOTE,
+    THUMBNAIL_CHARACTERS,
+    content,
+    cut,
+    escape,
+    fitted,
+    size,
+)
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.groups import function_count
 from epypes.wording import counted
@@ -46,6 +55,15 @@ def paint_page(*parts: str) -> str:
     )
 
 
+@cache
+def _asset(kind: str) -> str:
+    """Return the script or the style without what is there for people: comments, and blanks at the start of lines."""
+    text = (resources.files("epypes.display.paint") / f"explore.{kind}").read_text("utf-8")
+    text = re.sub(r"(?m)^\s*//.*\n|/\*.*?\*/", "", text)
+    text = re.sub(r"\n\s*", "\n", text).strip()
+    return re.sub(r"\s*([{};:,>])\s+", r"\1", text) if kind == "css" else text
+
+
 def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     """Return a picture as a figure."""
     # An image knows nothing of the page; where the script puts the picture itself, the page's style is there already.
@@ -54,8 +72,8 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     source = source.replace('"', "'").replace(QUOTE, '"')
     for sign, encoded in _IN_URI.items():
         source = source.replace(sign, encoded)
-    told = content(fitted(caption, _CAPTION_ROOM))
-    below = f'<figcaption style="font-size:12px">{told}</figcaption>' if caption else ""
+    text = content(fitted(caption, _CAPTION_ROOM))
+    below = f'<figcaption style="font-size:12px">{text}</figcaption>' if caption else ""
     return (
         f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto;scrollbar-width:thin">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
@@ -67,7 +85,7 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     """Return the picture of a graph as a figure, and what is inside each of its groups, to be opened below it.
 
     Each figure has a table twin and what the script needs to know. Rows of the twins, sources of functions and the
-    insides of groups are left out where they don't fit, and what was left out is said.
+    insides of groups are left out where they don't fit, and what was left out is stated.
 
     Parameters
     ----------
@@ -78,47 +96,45 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     """
     names = [group.name for group in graph.groups]
     pictures = [(graph, svg), *((group.graph, paint_svg(group.graph)) for group in graph.groups)]
-    room = _room_of(pictures) - taken - size("".join(_left_out(names)))
-    bare: list[str] = []
-    for name, (part, picture) in zip(("", *names), pictures, strict=True):
-        figure = paint_figure(picture, alt_text(part), part.caption)
-        least = size(_inside(name, part, figure) if bare else figure) + size(_data(part, {})) + _TWIN_CHARACTERS
-        if bare and least > room:
+    room = _room_of(pictures) - taken - size(_left_out(names))
+    figures: list[str] = []
+    alts = [alt_text(part) for part, _ in pictures]
+    for name, alt, (part, picture) in zip(("", *names), alts, pictures, strict=True):
+        figure = paint_figure(picture, alt, part.caption)
+        least = size(_inside(name, part, figure) if figures else figure) + size(_data(part, {})) + _TWIN_CHARACTERS
+        if figures and least > room:
             break
         room -= least
-        bare.append(figure)
-    parts = [part for part, _ in pictures[: len(bare)]]
+        figures.append(figure)
+    parts = [part for part, _ in pictures[: len(figures)]]
     # What is left is for twins and sources: as much for each function and token.
     each = max(room, 0) / max(sum(map(_vertices, parts)), 1)
-    first, *insides = (
-        _told(figure, part, int(each * _vertices(part))) for figure, part in zip(bare, parts, strict=True)
-    )
+    first, *insides = [
+        _explained(figure, part, alt, int(each * _vertices(part)))
+        for figure, part, alt in zip(figures, parts, alts, strict=False)
+    ]
     details = [_inside(name, part, figure) for name, part, figure in zip(names, parts[1:], insides, strict=False)]
-    return [first, *details, *_left_out(names[len(details) :])]
+    left_out = _left_out(names[len(details) :])
+    return [first, *details, *([left_out] if left_out else [])]
 
 
-def _told(figure: str, graph: GraphView, room: int) -> str:
+def _explained(figure: str, graph: GraphView, alt: str, room: int) -> str:
     """Add the twin of a figure and what the script needs to know, in ``room`` more characters than is their least."""
     # A fifth at least is kept for the rows of the twin.
     sources = _fitting(graph, room * 4 // 5)
     data = _data(graph, sources)
-    spent = size(data) - size(_data(graph, {}))
-    room += _TWIN_CHARACTERS - len(_STILL) - spent
-    twin = paint_twin(graph, alt_text(graph), room)
-    left = room - size(twin)
-    data = _data(graph, _fitting(graph, spent + left)) if left > 0 else data
-    return f"{figure.removesuffix(_END)}{_STILL}{data}{twin}{_END}"
+    room += _TWIN_CHARACTERS - len(_STILL) - sum(map(_source_size, sources))
+    return f"{figure.removesuffix(_END)}{_STILL}{data}{paint_twin(graph, alt, room)}{_END}"
 
 
 def _inside(name: str, graph: GraphView, figure: str) -> str:
-    told = f"{content(fitted(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}"
-    return f'<details class="epypes-inside" data-group="{escape(name)}"><summary>{told}</summary>{figure}</details>'
+    text = f"{content(fitted(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}"
+    return f'<details class="epypes-inside" data-group="{escape(name)}"><summary>{text}</summary>{figure}</details>'
 
 
-def _left_out(names: Sequence[str]) -> Iterator[str]:
-    if names:
-        some = content(cut(", ".join(names), _NAMED_CHARACTERS))
-        yield f"<p>Not shown here: the inside of {some}. Call ep.show(..., open=[...]).</p>"
+def _left_out(names: Sequence[str]) -> str:
+    some = content(cut(", ".join(names), _NAMED_CHARACTERS))
+    return f"<p>Not shown here: the inside of {some}. Call ep.show(..., open=[...]).</p>" if names else ""
 
 
 def _vertices(graph: GraphView) -> int:
@@ -133,65 +149,54 @@ def _room_of(pictures: Sequence[tuple[GraphView, str]]) -> int:
     thumbnails = sum(len(found) for _, svg in pictures for found in _THUMBNAIL.findall(svg))
     vertices = function_count(pictures[0][0]) + len({token.name for part, _ in pictures for token in part.tokens})
     twice = sum(_vertices(part) for part, _ in pictures) - vertices
-    fixed = CHARACTERS - len(paint_page())
     spent = min(thumbnails + CHARACTERS_OF_A_VERTEX * twice, THUMBNAIL_CHARACTERS)
-    return fixed + CHARACTERS_OF_A_VERTEX * vertices + spent
+    return CHARACTERS - len(paint_page()) + CHARACTERS_OF_A_VERTEX * vertices + spent
 
 
-@cache
-def _asset(kind: str) -> str:
-    """Return the script or the style without what is there for people: comments, and blanks at the start of lines."""
-    text = (resources.files("epypes.display.paint") / f"explore.{kind}").read_text("utf-8")
-    text = re.sub(r"(?m)^\s*//.*\n|/\*.*?\*/", "", text)
-    text = re.sub(r"\n\s*", "\n", text).strip()
-    return re.sub(r"\s*([{};:,>])\s+", r"\1", text) if kind == "css" else text
+# -- what the script needs to know ---------------------------------------------------------------------------------
+
+Texts = tuple[str, str]
 
 
-Texts = dict[tuple[str, str], list[int]]
-
-
-def _fitting(graph: GraphView, room: int) -> Texts:
+def _fitting(graph: GraphView, room: int) -> dict[Texts, list[int]]:
     """Return signatures and sources, with the functions that have them, so many as fit: the most relevant first."""
-    kept: Texts = {}
-    for place in sorted(range(len(graph.functions)), key=lambda place: _relevance(graph.functions[place])):
-        function = graph.functions[place]
+    kept: dict[Texts, list[int]] = {}
+    by_relevance = sorted(enumerate(graph.functions), key=lambda each: _WEIGHTS.get(each[1].state, -each[1].share))
+    for place, function in by_relevance:
         texts = function.signature, function.source
-        if not any(texts):
-            continue
-        room -= 5 + (0 if texts in kept else size(_json(texts)))
-        if room >= 0:
+        taken = 5 if texts in kept else _source_size(texts)
+        if any(texts) and taken <= room:
+            room -= taken
             kept.setdefault(texts, []).append(place)
-        elif texts not in kept:
-            room += 5 + size(_json(texts))
     return kept
 
 
-def _relevance(function: FunctionView) -> float:
-    return _WEIGHTS.get(function.state, -function.share)
+@lru_cache(maxsize=1_000)
+def _source_size(texts: Texts) -> int:
+    return size(_json(texts)) + 5
 
 
-def _data(graph: GraphView, kept: Texts) -> str:
+def _data(graph: GraphView, kept: Mapping[Texts, Sequence[int]]) -> str:
     """Return what the script needs to know, as text that does nothing by itself.
 
     Edges by function, a token that no run reads as its complement; then by function which of the texts are its own,
     null if they were left out.
     """
     owner = {place: index for index, places in enumerate(kept.values()) for place in places}
-    about = [
-        owner.get(place, None if function.signature or function.source else -1)
-        for place, function in enumerate(graph.functions)
-    ]
-    groups = {place: function.name for place, function in enumerate(graph.functions) if function.kind == "group"}
-    io = list(_io(graph)) if graph.draws_edges else []
-    data = {"io": io, "groups": groups, "about": about, "texts": list(kept)}
+    io: list[tuple[list[int], list[int]]] = [([], []) for _ in graph.functions] if graph.draws_edges else []
+    for edge in graph.edges if io else ():
+        io[edge.function][0 if edge.is_input else 1].append(edge.token if edge.is_live else ~edge.token)
+    data = {
+        "io": io,
+        "groups": {place: each.name for place, each in enumerate(graph.functions) if each.kind == "group"},
+        "about": [owner.get(place, _unexplained(each)) for place, each in enumerate(graph.functions)],
+        "texts": list(kept),
+    }
     return f'<script type="application/json" class="epypes-data">{_json(data)}</script>'
 
 
-def _io(graph: GraphView) -> Iterator[tuple[list[int], list[int]]]:
-    found: list[tuple[list[int], list[int]]] = [([], []) for _ in graph.functions]
-    for edge in graph.edges:
-        found[edge.function][0 if edge.is_input else 1].append(edge.token if edge.is_live else ~edge.token)
-    yield from found
+def _unexplained(function: FunctionView) -> int | None:
+    return None if function.signature or function.source else -1
 
 
 def _json(value: Any) -> str:

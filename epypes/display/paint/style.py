@@ -1,4 +1,4 @@
-"""Which colours and lines does a picture have?"""
+"""The colours and lines of a picture."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _COLOURS: Final = {
     "alarm": ("#fcebec", "color-mix(in srgb,@error 10%,@ground)"),
 }
 
-# Selector -> declarations. What a state says stands after what a kind says.
+# Selector -> declarations. The rule of a state stands after that of a kind.
 _RULES: Final = {
     "": "max-width:100%;height:auto;font:12px var(--jp-ui-font-family,system-ui,sans-serif)",
     " text": "fill:@text;text-anchor:middle;stroke:none",

@@ -1,4 +1,4 @@
-"""How is a GraphView painted as SVG?
+"""A graph as SVG.
 
 Graphviz gives the geometry only; every mark is painted here, so that names, values, thumbnails and states change
 without a new layout, and colours follow the page's theme.
@@ -6,21 +6,122 @@ without a new layout, and colours follow the page's theme.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Final
 
-from epypes.display.layout.geometry import Box, Layout
-from epypes.display.layout.place import lay_out
-from epypes.display.markup import escape, fitted, short_name
-from epypes.display.paint.edges import paint_edges
-from epypes.display.paint.functionmarks import function_box, paint_function
+from epypes.display.layout.geometry import Edge, Layout, Point
+from epypes.display.layout.placement import lay_out
 from epypes.display.paint.stages import paint_around
 from epypes.display.paint.style import STYLE
-from epypes.display.paint.tokenmarks import paint_token, token_box
-from epypes.display.views.graphview import GraphView
+from epypes.display.paint.vertices import function_box, paint_function, paint_token, token_box
+from epypes.display.text import escape, fitted, short_name
+from epypes.display.views.graphview import EdgeView, GraphView
 from epypes.display.views.groups import function_count
 from epypes.wording import counted
+
+_OFF: Final = " off"
+
+
+@lru_cache(maxsize=128)
+def paint_edges(edges: tuple[EdgeView, ...], ends: tuple[Edge, ...], layout: Layout) -> str:
+    """Paint the edges, those that no run uses first and dashed.
+
+    All of one kind are one path: a graph has many.
+
+    Parameters
+    ----------
+    edges
+        What is to be seen of them.
+    ends
+        By edge, the indices of the vertices that it joins.
+    layout
+        Without splines in a dense graph.
+    """
+    painted = []
+    for is_live, kind in ((False, _OFF), (True, "")):
+        places = [place for place, edge in enumerate(edges) if edge.is_live == is_live]
+        if places and layout.splines:
+            painted.append(_paint_splines([layout.splines[place] for place in places], kind))
+        elif places:
+            painted.append(_paint_lines([ends[place] for place in places], layout, kind))
+    return "\n".join(painted)
+
+
+def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
+    """Paint edges as one path of curves and one of their tips; each edge is a piece of both that begins with M."""
+    curves, tips = [], []
+    for *spline, tip in splines:
+        # What edges share looks like one line where each is painted whole.
+        curves.append(_curves(spline if kind == _OFF else _without_stops(spline)))
+        tips.append(f"M{_arrow(spline[-1], tip)}Z")
+    if kind == _OFF:
+        # Dashes over dashes would be a line.
+        curves, tips = _each_once(curves), list(dict.fromkeys(tips))
+    return f'<path class="edge{kind}" d="{"".join(map(_path, curves))}"/><path class="tip{kind}" d="{"".join(tips)}"/>'
+
+
+def _without_stops(spline: Sequence[Point]) -> list[Point]:
+    """Let one curve run where several would run straight on: an edge passes many others on its way out of a block."""
+    way = list(spline[:1])
+    for first in range(0, len(spline) - 1, 3):
+        curve = spline[first : first + 4]
+        if _is_straight(way[-4:]) and _is_straight(curve) and _are_in_line(way[-4], *curve[::3]):
+            way[-2:] = curve[2:]
+        else:
+            way += curve[1:]
+    return way
+
+
+def _is_straight(curve: Sequence[Point]) -> bool:
+    return len(curve) == 4 and curve[0] == curve[1] and curve[2] == curve[3]
+
+
+def _are_in_line(*points: Point) -> bool:
+    return any(len(set(along)) == 1 for along in zip(*points, strict=True))
+
+
+def _curves(spline: Sequence[Point]) -> list[tuple[str, str]]:
+    """Return the curves of a spline: where each starts, and its controls."""
+    at = [f"{x:.0f},{y:.0f}" for x, y in spline]
+    return [(at[first], " ".join(at[first + 1 : first + 4])) for first in range(0, len(at) - 1, 3)]
+
+
+def _each_once(splines: Iterable[list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
+    painted: set[tuple[str, str]] = set()
+    kept: list[list[tuple[str, str]]] = []
+    for curves in splines:
+        kept.append([curve for curve in curves if curve not in painted])
+        painted.update(curves)
+    return kept
+
+
+def _path(curves: list[tuple[str, str]]) -> str:
+    """Return curves as part of a path; where one starts at the end of the last one, that is not repeated."""
+    path, at = "", ""
+    for start, controls in curves:
+        path += f" {controls}" if start == at else f"M{start}C{controls}"
+        at = controls.rpartition(" ")[2]
+    return path
+
+
+def _paint_lines(ends: Iterable[tuple[int, int]], layout: Layout, kind: str) -> str:
+    """Paint edges as one path of straight lines between centres, under the vertices."""
+    at = layout.centres
+    lines = (f"M{at[a][0]:.0f},{at[a][1]:.0f}L{at[b][0]:.0f},{at[b][1]:.0f}" for a, b in ends)
+    return f'<path class="edge dense{kind}" d="{"".join(lines)}"/>'
+
+
+def _arrow(end: Point, tip: Point) -> str:
+    """Return a triangle from the end of a spline to its tip."""
+    dx, dy = tip[0] - end[0], tip[1] - end[1]
+    length = math.hypot(dx, dy) or 1.0
+    across = (-dy / length * 3.5, dx / length * 3.5)
+    corners = (tip, (end[0] + across[0], end[1] + across[1]), (end[0] - across[0], end[1] - across[1]))
+    return "L".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+
 
 # Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
 # Graphviz minutes and would fill the picture.
@@ -43,17 +144,14 @@ def paint_svg(graph: GraphView) -> str:
     LayoutUnavailable
         No Graphviz engine answered.
     """
-    functions = len(graph.functions)
-    boxes = (
-        *(function_box(function, graph.direction) for function in graph.functions),
-        *map(token_box, graph.tokens),
-    )
-    edges = tuple(
-        (functions + edge.token, edge.function) if edge.is_input else (edge.function, functions + edge.token)
-        for edge in graph.edges
-    )
-    is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
-    layout = lay_out(boxes, edges, is_dense, graph.direction)
+    functions, direction = len(graph.functions), graph.direction
+    function_boxes = [function_box(function, direction) for function in graph.functions]
+    boxes = (*function_boxes, *map(token_box, graph.tokens))
+    ends = tuple([
+        (functions + token, function) if is_input else (function, functions + token)
+        for function, token, is_input, _ in graph.edges
+    ])  # fmt: skip
+    layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction)
     around, bounds = paint_around(graph, layout)
     width, height = bounds.right - bounds.left + 2 * _MARGIN, bounds.bottom - bounds.top + 2 * _MARGIN
     size = f"{width:.0f}", f"{height:.0f}"
@@ -64,11 +162,15 @@ def paint_svg(graph: GraphView) -> str:
         f'style="min-width:{_LEAST_SCALE * width:.0f}px">'
     )
     parts = [head, f"<style>{STYLE}</style>", *around]
-    if graph.draws_edges:
-        parts += paint_edges(graph.edges, edges, layout)
-    parts += _paint_vertices(graph, boxes, layout)
-    parts.append("</svg>")
-    return "\n".join(parts)
+    if graph.draws_edges and ends:
+        parts.append(paint_edges(graph.edges, ends, layout))
+    centres = layout.centres
+    parts += [
+        paint_function(function, *placed, direction)
+        for function, placed in zip(graph.functions, zip(boxes, centres, strict=True), strict=False)
+    ]
+    parts += map(paint_token, graph.tokens, boxes[functions:], centres[functions:])
+    return "\n".join([*parts, "</svg>"])
 
 
 def least_width(svg: str) -> str:
@@ -79,21 +181,13 @@ def least_width(svg: str) -> str:
 
 def alt_text(graph: GraphView) -> str:
     """Return the graph in one sentence, for screen readers."""
-    order = ", ".join(short_name(function.name) for function in graph.functions[:12])
+    order = ", ".join(map(short_name, [function.name for function in graph.functions[:12]]))
     more = ", ..." if len(graph.functions) > 12 else ""
     functions = counted(function_count(graph), "function")
-    said = f"Computational graph of {functions}: {order}{more}. {fitted(graph.caption, _CAPTION_ROOM)}".strip()
+    text = f"Computational graph of {functions}: {order}{more}. {fitted(graph.caption, _CAPTION_ROOM)}".strip()
     if not graph.title:
-        return said
+        return text
     stages = [short_name(stage.name) for stage in graph.before] + ["the graph"] * bool(graph.before or graph.after)
     stages += [short_name(stage.name) for stage in graph.after]
     through = f", events go through {', '.join(stages)}" if stages else ""
-    return f"Pipeline {short_name(graph.title)}{through}. {said}"
-
-
-def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
-    functions = len(graph.functions)
-    for function, box, centre in zip(graph.functions, boxes, layout.centres, strict=False):
-        yield paint_function(function, box, centre, graph.direction)
-    for token, box, centre in zip(graph.tokens, boxes[functions:], layout.centres[functions:], strict=True):
-        yield paint_token(token, box, centre)
+    return f"Pipeline {short_name(graph.title)}{through}. {text}"

@@ -1,1 +1,1 @@
-"""What is shown of one value?"""
+"""Previews of values."""

@@ -1,28 +1,34 @@
-"""What is shown of an array?"""
+"""Previews of arrays and of numbers of numpy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.markup import cut
-from epypes.display.previews.charts import bar_chart, line_chart
+from epypes.display.previews.drawing import bar_chart, line_chart
+from epypes.display.previews.encoding import encode_small, is_pooled, pillow_image
 from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
-from epypes.display.previews.imagekinds import image_kind, is_image, one_channel, sampled
-from epypes.display.previews.kinds import is_of
-from epypes.display.previews.labels import label_text
-from epypes.display.previews.ranges import is_of_dtype
-from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, is_pooled, pillow_image
-from epypes.display.previews.registry import ours
+from epypes.display.previews.images import (
+    few_of,
+    image_kind,
+    is_image,
+    is_of_dtype,
+    label_text,
+    one_channel,
+    sampled,
+    some_of,
+    statistics_text,
+)
+from epypes.display.previews.introspection import is_of
+from epypes.display.previews.model import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
+from epypes.display.previews.objects import record_sketch
+from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
-from epypes.display.previews.shown import Backdrop, Look, Preview, Scene, Sketch
-from epypes.display.previews.statistics import few_of, some_of, statistics_text
-from epypes.display.previews.tables import record_sketch
+from epypes.display.text import cut
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
+    from epypes.display.previews.model import Array
 
-    Array = npt.NDArray[Any]
 
 _MOST_ELONGATED: Final = 6
 _SMALL_SIDE: Final = 4
@@ -33,7 +39,7 @@ _LEAST_BINS: Final = 8
 _PLACES: Final = ((2,), (1, 2), (1, 4), (4,))
 
 
-@ours("numpy.generic")
+@built_in("numpy.generic")
 def _number_sketch(number: Any, look: Look) -> Preview:
     """Look at a number of numpy, which has a dtype and no axes."""
     if number.dtype.kind in "mM":
@@ -50,7 +56,7 @@ def plain_array(array: Any) -> Array:
     return np.asarray(array)
 
 
-@ours("numpy.ndarray")
+@built_in("numpy.ndarray")
 def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     """Look at an array by its shape and dtype."""
     array = plain_array(array)
@@ -64,8 +70,8 @@ def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     if closer is None:
         return _plain(array)
     text = array_text(array) + _order_text(array, look) * (closer is image_sketch)
-    said = f"{text}, {statistics_text(few_of(array), array)}"
-    brief = Preview(text, said, rows=_rows(array) if array.ndim > 1 else ())
+    detail = f"{text}, {statistics_text(few_of(array), array)}"
+    brief = Preview(text, detail, rows=_rows(array) if array.ndim > 1 else ())
     return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
 
 
@@ -91,16 +97,16 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     kind = image_kind(array, sample)
     ends = look.range_of(array)
     text = array_text(array) + _order_text(array, look)
-    said, note = [text, statistics_text(sample, array)], ""
+    detail, note = [text, statistics_text(sample, array)], ""
     if kind == "labels":
-        said.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
+        detail.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
     elif kind == "mask":
-        said.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
+        detail.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
     elif not is_of_dtype(array.dtype, ends):
         note = f"shown from {ends[0]:.6g} to {ends[1]:.6g}"
-        said.append(note)
+        detail.append(note)
     return Sketch(
-        Preview(text, ", ".join(said)),
+        Preview(text, ", ".join(detail)),
         lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
         is_image=True,
         scene=lambda: Scene(Backdrop(array, look.order, ends, "")),
@@ -128,8 +134,8 @@ def _drawn_numbers(array: Array, look: Look) -> Sketch:
     text = array_text(array)
     is_histogram = _are_counts(array)
     name = "histogram" if is_histogram else "signal"
-    said = f"{text} {name}, {statistics_text(some_of(array), array)}"
-    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(array) if is_histogram else line_chart(array))
+    detail = f"{text} {name}, {statistics_text(some_of(array), array)}"
+    return Sketch(Preview(text, detail), lambda most_bytes: bar_chart(array) if is_histogram else line_chart(array))
 
 
 def _are_counts(array: Array) -> bool:
@@ -138,22 +144,6 @@ def _are_counts(array: Array) -> bool:
         return False
     some = some_of(array)
     return array.ndim == 2 or bool(((some >= 0) & (some % 1 == 0)).all())
-
-
-def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
-    """Look at counts and edges as ``np.histogram`` returns them."""
-    counts, edges = value
-    text = f"{len(counts)} bins"
-    said = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
-    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(counts))
-
-
-def is_histogram(value: Any) -> bool:
-    """Whether a value is what ``np.histogram`` returns."""
-    if len(value) != 2 or not all(is_of(part, "numpy", "ndarray") and part.ndim == 1 for part in value):
-        return False
-    counts, edges = value
-    return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
 
 
 def _plain(array: Array) -> Preview:
@@ -167,7 +157,9 @@ def _rows(array: Array) -> tuple[str, ...]:
         return ()
     if array.ndim == 1:
         return (
-            row_texts(array, len(array), _MOST_ROWS) if array.dtype.kind not in "biuf" else (" ".join(_cells(array)),)
+            row_texts(map(short_repr, array), len(array), _MOST_ROWS)
+            if array.dtype.kind not in "biuf"
+            else (" ".join(_cells(array)),)
         )
     kept = len(array) if len(array) <= _MOST_ROWS else _MOST_ROWS - 1
     cells = [_cells(row) for row in array[:kept]]

@@ -1,4 +1,4 @@
-"""What is shown of a value that is no array and no table?"""
+"""Previews of plain values, containers, records and tables."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ import enum
 import itertools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from epypes.display.markup import cut
-from epypes.display.previews.arrays import histogram_sketch, is_histogram
+from epypes.display.previews.drawing import bar_chart
 from epypes.display.previews.features import list_sketch
-from epypes.display.previews.fields import fields_of
-from epypes.display.previews.kinds import items_in, kind_name, length_of, pairs_in, stored
-from epypes.display.previews.registry import ours
-from epypes.display.previews.short import float_text, item_texts, reason, row_texts, short_repr, shown_items
-from epypes.display.previews.shown import Look, Preview, Sketch
-from epypes.display.previews.tables import dict_list_sketch, is_dict_list
+from epypes.display.previews.images import some_of, statistics_text
+from epypes.display.previews.introspection import fields_of, is_of, items_in, kind_name, length_of, pairs_in, stored
+from epypes.display.previews.model import Look, Preview, Sketch
+from epypes.display.previews.registry import built_in
+from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items
+from epypes.display.text import cut, memory_text
+from epypes.wording import counted
 
 _MOST_ROWS: Final = 4
-_LOOKED_AT: Final = 200
 # A tuple that is so short is written out on the vertex: the sides of a kernel, a size.
 _PLAIN_TUPLE: Final = 4
 _NUMBERS: Final = (int, float, bool)
 
 
-@ours(int, str, bytes, bytearray, complex, type(None))
+@built_in(int, str, bytes, bytearray, complex, type(None))
 def _plain(value: Any, look: Look) -> Preview:
     if issubclass(type(type(value)), enum.EnumType):
         return _enum(value, look)
@@ -36,41 +35,41 @@ def _plain(value: Any, look: Look) -> Preview:
     return Preview(short, f"{_name(value)}{size} {short}")
 
 
-@ours(float)
+@built_in(float)
 def _float(value: float, look: Look) -> Preview:
     if issubclass(type(type(value)), enum.EnumType) or not math.isfinite(value):
         return _plain(value, look)
     return Preview(float_text(value), f"{_name(value)} {float.__repr__(value)}")
 
 
-@ours(enum.Enum)
+@built_in(enum.Enum)
 def _enum(value: Any, look: Look) -> Preview:
     (name,), (content,) = stored(value, "_name_"), stored(value, "_value_")
     text = f"{_name(value)}.{name}"
     return Preview(text, f"{text} = {short_repr(content)}")
 
 
-@ours(BaseException)
+@built_in(BaseException)
 def _exception(value: BaseException, look: Look) -> Preview:
     return Preview(reason(value), reason(value, 200))
 
 
-@ours("pathlib.PurePath", "pathlib._local.PurePath")
+@built_in("pathlib.PurePath", "pathlib._local.PurePath")
 def _path(value: Any, look: Look) -> Preview:
     text = os.fspath(value)
     return Preview(value.name or text, f"{_name(value)} {cut(text, 200)}")
 
 
-@ours(list)
+@built_in(list)
 def _list(value: Sequence[Any], look: Look) -> Sketch | Preview:
-    # A subclass may have ways of its own to reach its items, which are nobody else's.
+    # A subclass may have ways of its own to reach its items, which are not used.
     plain = value if type(value) is list else list(items_in(value))
     if is_dict_list(plain):
         return dict_list_sketch(plain)
     return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
 
 
-@ours(tuple)
+@built_in(tuple)
 def _tuple(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
     plain = value if type(value) is tuple else tuple(items_in(value))
     if is_histogram(plain):
@@ -83,20 +82,20 @@ def _tuple(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
     return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
 
 
-@ours(set, frozenset)
+@built_in(set, frozenset)
 def _set(value: Any, look: Look) -> Preview:
     return _items(value)
 
 
-@ours(dict, "types.MappingProxyType", "builtins.mappingproxy")
+@built_in(dict, "types.MappingProxyType", "builtins.mappingproxy")
 def _dict(value: Any, look: Look) -> Preview:
     count = length_of(value) or len(value)
-    rows = item_texts(value, count, _MOST_ROWS) or ("(empty)",)
+    rows = row_texts(_item_rows(value), count, _MOST_ROWS) or ("(empty)",)
     keys = ", ".join(short_repr(key) for key, _ in itertools.islice(pairs_in(value), 8))
     return Preview(f"{_name(value)} of {count}", cut(f"{_name(value)} of {count}: {keys}", 200), rows=rows)
 
 
-@ours(object)
+@built_in(object)
 def _object(value: Any, look: Look) -> Preview:
     fields = fields_of(value)
     if fields is not None:
@@ -107,15 +106,105 @@ def _object(value: Any, look: Look) -> Preview:
 
 def _fields(value: Any, fields: dict[str, Any]) -> Preview:
     text = _name(value)
-    said = ", ".join(f"{name}: {short_repr(item)}" for name, item in itertools.islice(fields.items(), 8))
-    return Preview(text, cut(f"{text}: {said}", 280), rows=item_texts(fields, len(fields), _MOST_ROWS))
+    detail = ", ".join(f"{name}: {short_repr(item)}" for name, item in itertools.islice(fields.items(), 8))
+    return Preview(text, cut(f"{text}: {detail}", 280), rows=row_texts(_item_rows(fields), len(fields), _MOST_ROWS))
 
 
 def _items(value: Any) -> Preview:
     count = length_of(value)
-    text, rows = f"{_name(value)} of {count}", row_texts(shown_items(value), count, _MOST_ROWS)
+    text, rows = f"{_name(value)} of {count}", row_texts(map(short_repr, shown_items(value)), count, _MOST_ROWS)
     return Preview(text, f"{text}: {short_repr(value)}", rows=rows or ("(empty)",))
+
+
+def _item_rows(mapping: Any) -> Iterator[str]:
+    for key, value in pairs_in(mapping):
+        yield f"{_label(key)}: {short_repr(value)}"
 
 
 def _name(value: Any) -> str:
     return cut(kind_name(type(value)), 20)
+
+
+def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
+    """Look at counts and edges as ``np.histogram`` returns them."""
+    counts, edges = value
+    text = f"{len(counts)} bins"
+    detail = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
+    return Sketch(Preview(text, detail), lambda most_bytes: bar_chart(counts))
+
+
+def is_histogram(value: Any) -> bool:
+    """Whether a value is what ``np.histogram`` returns."""
+    if len(value) != 2 or not all(is_of(part, "numpy", "ndarray") and part.ndim == 1 for part in value):
+        return False
+    counts, edges = value
+    return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
+
+
+# -- tables -----------------------------------------------------------------------------------------------------------
+
+_MOST_COLUMNS: Final = 4
+_NAMED: Final = 8
+_ROWS: Final = 3
+_ROW_CHARACTERS: Final = 60
+
+
+# pandas 3 says where a class is imported from, earlier ones where it is defined.
+@built_in("pandas.DataFrame", "pandas.core.frame.DataFrame")
+def _frame(frame: Any, look: Look) -> Preview:
+    names = [_label(name) for name in itertools.islice(frame.columns, _NAMED)]
+    kinds = [str(kind) for kind in itertools.islice(frame.dtypes, _NAMED)]
+    columns = ", ".join(f"{cut(name, 20)} {kind}" for name, kind in zip(names, kinds, strict=True))
+    rows = frame.iloc[:_ROWS, :_MOST_COLUMNS].itertuples(index=False, name=None)
+    return _table(len(frame), frame.shape[1], names, list(rows), f"DataFrame: {columns}")
+
+
+@built_in("pandas.Series", "pandas.core.series.Series")
+def _series(series: Any, look: Look) -> Preview:
+    rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
+    name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
+    more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
+    detail = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
+    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=(*rows, *more))
+
+
+def record_sketch(array: Any) -> Preview:
+    """Look at an array with named fields."""
+    names = list(array.dtype.names)
+    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in array.flat[:_ROWS]]
+    fields = ", ".join(f"{cut(name, 20)} {array.dtype[name]}" for name in names[:_NAMED])
+    return _table(array.size, len(names), names, rows, f"array of {memory_text(array.nbytes)}: {fields}")
+
+
+def is_dict_list(value: Sequence[Any]) -> bool:
+    """Whether a list is a table: a few dicts of the same texts as keys, as far as its first items show."""
+    first = value[0] if len(value) else None
+    if type(first) is not dict or not first or not all(type(key) is str for key in first):
+        return False
+    return all(type(row) is dict and row.keys() == first.keys() for row in value[:_NAMED])
+
+
+def dict_list_sketch(value: Sequence[dict[str, Any]]) -> Preview:
+    """Look at a list of dicts of the same keys."""
+    names = list(value[0])
+    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in value[:_ROWS]]
+    return _table(len(value), len(names), names, rows, f"list of {len(value)} dicts: {', '.join(names[:_NAMED])}")
+
+
+def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], detail: str) -> Preview:
+    text = f"{counted(count, 'row')} x {columns} columns"
+    more = ", ..." if columns > _NAMED else ""
+    lines = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    shown = ("  ".join(map(str.ljust, line, widths)).rstrip()[:_ROW_CHARACTERS] for line in lines)
+    return Preview(text, cut(f"{detail}{more}; {text}", 280), rows=tuple(shown))
+
+
+def _cell(value: Any) -> str:
+    if is_of(value, "numpy", "generic"):
+        value = value.item()
+    return cut(f"{value:.4g}" if type(value) is float else _label(value), 12)
+
+
+def _label(value: Any) -> str:
+    return value if type(value) is str else short_repr(value)

@@ -1,4 +1,4 @@
-"""Which function looks at a value of this type?
+"""The registry of functions that look at values, by type.
 
 Kinds are classes or their dotted names, so that a package is known without being imported. A value is looked at by the
 function of the first class in its method resolution order that has one.
@@ -10,57 +10,69 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar, overload
 from weakref import WeakKeyDictionary
 
-from epypes.display.previews.kinds import dotted_name, kind_name, parents
-from epypes.display.previews.shown import Look
+from epypes.display.previews.introspection import dotted_name, kind_name, parents
+from epypes.display.previews.model import Look
 from epypes.run.guard import lend
 
 _Function = TypeVar("_Function", bound=Callable[[Any], Any])
 # What a preview function may return is checked where it is called.
-Looker = Callable[[Any, Look], Any]
-_Looker = TypeVar("_Looker", bound=Looker)
+PreviewFunction = Callable[[Any, Look], Any]
+_BuiltIn = TypeVar("_BuiltIn", bound=PreviewFunction)
 
 
-class Registry:
+class _Registry:
     """Functions by class, and by a class's dotted name."""
 
     def __init__(self) -> None:
         # Weak, so that a class of a notebook that was defined again can go.
-        self._by_class: WeakKeyDictionary[type, Looker] = WeakKeyDictionary()
-        self._by_name: dict[str, Looker] = {}
+        self._by_class: WeakKeyDictionary[type, PreviewFunction] = WeakKeyDictionary()
+        self._by_name: dict[str, PreviewFunction] = {}
+        self.revision = 0
 
-    def add(self, kind: type | str, looker: Looker) -> None:
+    def add(self, kind: type | str, function: PreviewFunction) -> None:
         """Take a function for a class or a dotted name; it replaces an earlier one."""
+        self.revision += 1
         if isinstance(kind, type):
-            self._by_class[kind] = looker
+            self._by_class[kind] = function
         else:
-            self._by_name[kind] = looker
+            self._by_name[kind] = function
 
-    def get(self, kind: type) -> Looker | None:
+    def get(self, kind: type) -> PreviewFunction | None:
         """Return the function of this very class."""
         found = self._by_class.get(kind)
-        return found or self._by_name.get(dotted_name(kind))
+        return found if found or not self._by_name else self._by_name.get(dotted_name(kind))
 
 
-OURS: Final = Registry()
-_users: Final = Registry()
+_built_in: Final = _Registry()
+_users: Final = _Registry()
 
 
-def looker_of(kind: type) -> Looker:
+def preview_function_of(kind: type) -> PreviewFunction:
     """Return the function that looks at values of a class; of two for one class, the user's."""
     for parent in parents(kind):
-        found = _users.get(parent) or OURS.get(parent)
+        found = _users.get(parent) or _built_in.get(parent)
         if found is not None:
             return found
     raise TypeError(f"nothing is registered for {kind_name(kind)}")
 
 
-def ours(*kinds: type | str) -> Callable[[_Looker], _Looker]:
+def is_shown_by_user(kind: type) -> bool:
+    """Whether a user's function looks at values of a class, or of one of its parents."""
+    return any(map(_users.get, parents(kind)))
+
+
+def users_revision() -> int:
+    """Return how often a user has registered a function."""
+    return _users.revision
+
+
+def built_in(*kinds: type | str) -> Callable[[_BuiltIn], _BuiltIn]:
     """Register a function of this package, as a decorator."""
 
-    def register(looker: _Looker) -> _Looker:
+    def register(function: _BuiltIn) -> _BuiltIn:
         for kind in kinds:
-            OURS.add(kind, looker)
-        return looker
+            _built_in.add(kind, function)
+        return function
 
     return register
 
@@ -70,7 +82,7 @@ def register_preview(kind: type | str, function: None = None) -> Callable[[_Func
 @overload
 def register_preview(kind: type | str, function: _Function) -> _Function: ...
 def register_preview(kind: type | str, function: Callable[[Any], Any] | None = None) -> Any:
-    """Say how values of a type are shown in pictures of graphs and runs.
+    """Register how values of a type are shown in pictures of graphs and runs.
 
     Parameters
     ----------

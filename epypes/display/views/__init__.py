@@ -1,1 +1,1 @@
-"""What is to be seen of a graph, a runner, a run, a plan or a pipeline, whoever paints it?"""
+"""Views of graphs, runners, runs, plans and pipelines, which any painter can read."""

@@ -1,12 +1,17 @@
-"""What does the frozen picture of a graph consist of?"""
+"""The frozen view of a graph, which painters read alone, and its JSON."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+import base64
+import functools
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, Final, Literal, NamedTuple
 
 from epypes.display.layout.geometry import Direction as Direction
-from epypes.display.previews.shown import Preview
+from epypes.display.previews.model import Picture, Preview
 from epypes.images import Order
 
 # For each vertex.
@@ -20,8 +25,7 @@ FunctionState = Literal[
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class TokenView:
+class TokenView(NamedTuple):
     """What is to be seen of a token.
 
     Attributes
@@ -42,8 +46,7 @@ class TokenView:
     first: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class FunctionView:
+class FunctionView(NamedTuple):
     """What is to be seen of a function.
 
     Attributes
@@ -73,8 +76,7 @@ class FunctionView:
     source: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class StageView:
+class StageView(NamedTuple):
     """What is to be seen of one stage of a reactive pipeline, outside its graph.
 
     Attributes
@@ -144,7 +146,7 @@ class GraphView:
 
     @property
     def draws_edges(self) -> bool:
-        """Whether its edges can be seen; of too many, nobody sees one."""
+        """Whether its edges can be seen: there are not too many."""
         return len(self.edges) <= _MOST_EDGES * (len(self.functions) + len(self.tokens))
 
     def io(self) -> list[tuple[list[str], list[str]]]:
@@ -161,3 +163,67 @@ class GroupView:
 
     name: str
     graph: GraphView
+
+
+def to_json(graph: GraphView) -> dict[str, Any]:
+    """Return a view as what ``json.dumps`` takes: a record is an object by the names of its fields, a picture a URI."""
+    written: dict[str, Any] = _written(graph)
+    return written
+
+
+def from_json(written: Mapping[str, Any]) -> GraphView:
+    """Return the view that ``to_json`` has written; fields that are missing have their defaults.
+
+    Raises
+    ------
+    TypeError, ValueError
+        This is not a view.
+    """
+    if not isinstance(written, Mapping):
+        raise TypeError(f"A view in JSON is an object, not {type(written).__name__!r}.")
+    graph: GraphView = _read(GraphView, written)
+    return graph
+
+
+def _written(value: Any) -> Any:
+    if isinstance(value, Picture):
+        data = base64.b64encode(value.data).decode()
+        return {"uri": f"data:{value.media_type};base64,{data}", "width": value.width, "height": value.height}
+    if is_dataclass(value):
+        return {field.name: _written(getattr(value, field.name)) for field in fields(value)}
+    if hasattr(value, "_asdict"):
+        return {name: _written(item) for name, item in value._asdict().items()}
+    return [_written(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _read(kind: Any, written: Any) -> Any:
+    """Return a value of a kind, as an annotation of a record says it."""
+    if Picture in _parts(kind) and isinstance(written, Mapping):
+        media_type, _, data = written["uri"].removeprefix("data:").partition(";base64,")
+        return Picture(base64.b64decode(data), media_type, written["width"], written["height"])
+    if isinstance(written, Mapping):
+        (record,) = (part for part in _parts(kind) if hasattr(part, "__annotations__"))
+        kinds = _kinds(record)
+        return record(**{name: _read(kinds[name], item) for name, item in written.items() if name in kinds})
+    if isinstance(written, list):
+        return tuple(
+            _read(item_kind, item) for item_kind, item in zip(_item_kinds(kind, len(written)), written, strict=True)
+        )
+    return written
+
+
+@functools.cache
+def _kinds(record: type) -> dict[str, Any]:
+    return typing.get_type_hints(record)
+
+
+def _parts(kind: Any) -> tuple[Any, ...]:
+    """Return the kinds of which a value may be one."""
+    return typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
+
+
+def _item_kinds(kind: Any, count: int) -> tuple[Any, ...]:
+    """Return the kind of each item of a tuple."""
+    (of,) = (part for part in _parts(kind) if typing.get_origin(part) is tuple)
+    items = typing.get_args(of)
+    return items[:1] * count if items[-1] is Ellipsis else items

@@ -1,4 +1,4 @@
-"""How does a view look when the functions of a group are one box?
+"""Groups: functions that are drawn as one box.
 
 A group is given by ``ep.group``, or by the names of functions: in a large graph those of one prefix, such as
 ``left.blur`` and ``left.canny``, are one group.
@@ -70,7 +70,7 @@ def twice_seen(cg: CompGraph, groups: Mapping[str, Sequence[str]]) -> int:
 
 
 def _is_within(cg: CompGraph, token: str, functions: frozenset[str]) -> bool:
-    """Whether only these functions have to do with a token that somebody takes."""
+    """Whether a token is taken, and taken and made by these functions only."""
     takers, maker = cg.digraph.consumers.get(token, ()), cg.digraph.producer.get(token)
     return bool(takers) and functions.issuperset(takers) and (maker is None or maker in functions)
 
@@ -79,7 +79,7 @@ def collapsed(graph: GraphView, groups: Mapping[str, Sequence[str]]) -> GraphVie
     """Draw each group as one box, and give what is inside as graphs of their own.
 
     Tokens that are made and taken inside, and hyperparameters that are taken inside only, disappear into the box; those
-    that come from outside, and those that nobody takes, stay.
+    that come from outside, and those that no function takes, stay.
     """
     group_by_place = _group_by_place(graph, groups)
     if not group_by_place:
@@ -204,7 +204,7 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
 def _without_thumbnail(token: TokenView) -> TokenView:
     if token.preview is None:
         return token
-    return replace(token, preview=replace(token.preview, picture=None, chart=None, rows=()))
+    return token._replace(preview=replace(token.preview, picture=None, chart=None, rows=()))
 
 
 def function_count(graph: GraphView) -> int:

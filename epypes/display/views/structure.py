@@ -1,19 +1,33 @@
-"""What is to be seen of a graph whatever has been run: its parts, the branches chosen, what is to be written or old?"""
+"""The structure of a graph, whatever has been run: its parts, chosen branches, sources and redefinitions."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
-from typing import Any, Final
+import inspect
+import linecache
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import islice
+from types import CodeType, FunctionType
+from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
-from epypes.display.markup import cut
 from epypes.display.previews.preview import preview
+from epypes.display.previews.short import without_addresses
+from epypes.display.text import cut
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
-from epypes.display.views.source import graph_lines, signature_and_source
-from epypes.graph import CompGraph, Switch, as_switch, colour_order, inner_graph, is_redefined_inside, redefined
+from epypes.graph import (
+    CompGraph,
+    Switch,
+    as_switch,
+    colour_order,
+    inner_graph,
+    is_redefined_inside,
+    redefined,
+    unwrapped,
+)
 from epypes.wording import counted
 
-TO_BE_WRITTEN: Final = "to be written"
+_TO_BE_WRITTEN: Final = "to be written"
 _REDEFINED: Final = "redefined since: build the graph again"
 _REDEFINED_INSIDE: Final = "a function inside was redefined: build again"
 _SELECTOR_CHARACTERS: Final = 20
@@ -21,6 +35,14 @@ _KEY_CHARACTERS: Final = 16
 _NAMED: Final = 3
 # By graph the last structure, with what it depends on: a run changes values, and rarely more.
 _kept: WeakKeyDictionary[CompGraph, tuple[tuple[Any, ...], GraphView]] = WeakKeyDictionary()
+
+
+class _Choices(NamedTuple):
+    """What runs depend on: by switch the key of the chosen branch, and which functions are not needed or redefined."""
+
+    branches: Mapping[str, Any]
+    left_out: Collection[str]
+    redefined: Mapping[str, bool]
 
 
 def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str]) -> GraphView:
@@ -33,21 +55,22 @@ def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collectio
     left_out
         The functions that are not needed; they, and the tokens that only they make or take, get this state.
     """
-    old = tuple((name, is_redefined_inside(cg.functions[name])) for name in redefined(cg))
-    key = old, tuple(branches.items()), tuple(left_out)
+    # Whether it is a function inside that was redefined.
+    old = {name: is_redefined_inside(cg.functions[name]) for name in redefined(cg)}
+    key = tuple(old.items()), tuple(branches.items()), tuple(left_out)
     kept = _kept.get(cg)
     if kept is None or kept[0] != key:
-        kept = _kept[cg] = key, _structure(cg, branches, left_out, frozenset(name for name, _ in old))
+        kept = _kept[cg] = key, _structure(cg, _Choices(branches, left_out, old))
     return kept[1]
 
 
-def _structure(cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str], old: frozenset[str]) -> GraphView:
-    unread = {name: _unread(cg, name, branches) for name in cg.switches}
+def _structure(cg: CompGraph, choices: _Choices) -> GraphView:
+    unread = {name: _unread(cg, name, choices.branches) for name in cg.switches}
     return GraphView(
-        tuple(_function_view(cg, name, branches, name in left_out, name in old) for name in cg.functions),
-        tuple(_token_view(cg, token, branches, left_out, unread) for token in cg.tokens),
-        tuple(_edges(cg, left_out, unread)),
-        _redefined_caption(cg, [name for name in cg.functions if name in old]),
+        tuple(_function_view(cg, name, choices) for name in cg.functions),
+        tuple(_token_view(cg, token, choices, unread) for token in cg.tokens),
+        tuple(_edges(cg, choices.left_out, unread)),
+        _redefined_caption(choices.redefined),
     )
 
 
@@ -61,24 +84,21 @@ def _unread(cg: CompGraph, name: str, branches: Mapping[str, Any]) -> frozenset[
     return frozenset(tokens) - read
 
 
-def _function_view(
-    cg: CompGraph, name: str, branches: Mapping[str, Any], is_left_out: bool, is_redefined: bool
-) -> FunctionView:
-    state: FunctionState = "left out" if is_left_out else "static"
-    function = as_switch(cg.functions[name])
-    if function is not None:
-        return FunctionView(name, state, kind="switch", notes=(_choice(cg, name, function, branches),))
+def _function_view(cg: CompGraph, name: str, choices: _Choices) -> FunctionView:
+    state: FunctionState = "left out" if name in choices.left_out else "static"
+    function = cg.functions[name]
+    switch, inner = as_switch(function), inner_graph(function)
+    if switch is not None:
+        return FunctionView(name, state, kind="switch", notes=(_choice(cg, name, switch, choices.branches),))
     if name in cg.placeholders:
-        return FunctionView(name, state, kind="placeholder", notes=(TO_BE_WRITTEN,))
-    inner, inside = inner_graph(cg.functions[name]), is_redefined and is_redefined_inside(cg.functions[name])
-    old = (_REDEFINED_INSIDE if inside else _REDEFINED,) * is_redefined
+        return FunctionView(name, state, kind="placeholder", notes=(_TO_BE_WRITTEN,))
+    old = name in choices.redefined
+    notes = ((_REDEFINED_INSIDE if choices.redefined[name] else _REDEFINED),) if old else ()
     if inner is None:
-        signature, source = signature_and_source(cg.functions[name])
-        return FunctionView(name, state, notes=old, is_redefined=is_redefined, signature=signature, source=source)
-    note = f"pipeline of {counted(len(inner.functions), 'function')}"
-    return FunctionView(
-        name, state, kind="pipeline", notes=(note, *old), is_redefined=is_redefined, source=graph_lines(inner)
-    )
+        signature, source = signature_and_source(function)
+        return FunctionView(name, state, notes=notes, is_redefined=old, signature=signature, source=source)
+    notes = (f"pipeline of {counted(len(inner.functions), 'function')}", *notes)
+    return FunctionView(name, state, kind="pipeline", notes=notes, is_redefined=old, source=_graph_lines(inner))
 
 
 def _choice(cg: CompGraph, name: str, function: Switch, branches: Mapping[str, Any]) -> str:
@@ -89,20 +109,13 @@ def _choice(cg: CompGraph, name: str, function: Switch, branches: Mapping[str, A
     return f"{selector} = {cut(key if isinstance(key, str) else preview(key).text, _KEY_CHARACTERS)}"
 
 
-def _token_view(
-    cg: CompGraph,
-    token: str,
-    branches: Mapping[str, Any],
-    left_out: Collection[str],
-    unread: Mapping[str, frozenset[str]],
-) -> TokenView:
-    maker = cg.digraph.producer.get(token)
+def _token_view(cg: CompGraph, token: str, choices: _Choices, unread: Mapping[str, frozenset[str]]) -> TokenView:
+    branches, left_out, maker = choices.branches, choices.left_out, cg.digraph.producer.get(token)
     if maker is not None:
         is_left_out = maker in left_out
     else:
-        is_left_out = all(
-            name in left_out or (name in branches and token in unread[name]) for name in cg.digraph.consumers[token]
-        )
+        consumers = cg.digraph.consumers[token]
+        is_left_out = all(name in left_out or (name in branches and token in unread[name]) for name in consumers)
     return TokenView(token, "payload", "left out" if is_left_out else "static", order=colour_order(cg, token))
 
 
@@ -116,21 +129,135 @@ def _edges(cg: CompGraph, left_out: Collection[str], unread: Mapping[str, frozen
             yield EdgeView(index, place[token], False, is_needed)
 
 
-def _redefined_caption(cg: CompGraph, names: list[str]) -> str:
-    if not names:
+def _redefined_caption(redefined: Mapping[str, bool]) -> str:
+    if not redefined:
         return ""
-    some = ", ".join(_redefined_name(cg, name) for name in names[:_NAMED])
-    some = some[0].upper() + some[1:]
+    names = [
+        f"{'a function inside ' * is_inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
+        for name, is_inside in redefined.items()
+    ]
+    some = ", ".join(names[:_NAMED])
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     verb = "was" if len(names) == 1 else "were"
-    return f"{some}{more} {verb} redefined since the graph was built: run the cell that builds it again"
+    start = some[0].upper() + some[1:]
+    return f"{start}{more} {verb} redefined since the graph was built: run the cell that builds it again"
 
 
-def _redefined_name(cg: CompGraph, name: str) -> str:
-    inside = "a function inside " * is_redefined_inside(cg.functions[name])
-    return f"{inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
+# -- signatures and sources ----------------------------------------------------------------------------------------
+
+SIGNATURE_CHARACTERS: Final = 200
+SOURCE_LINES: Final = 30
+LINE_CHARACTERS: Final = 120
+_DOCUMENTED: Final = "# no source in Python; its documentation begins:"
+# A re-display of 200 functions must not look at 200 files again. A function that is defined again is another object.
+_sources: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 
 
-def with_caption(text: str, structure: GraphView) -> str:
-    """Return a caption that begins with this text and goes on with the structure's own."""
-    return f"{text}. {structure.caption}" if structure.caption else text
+def signature_and_source(function: Any) -> tuple[str, str]:
+    """Return a function's parameters, and the first lines of its source; never raises.
+
+    Those of the user's own function in what is decorated, partial or a node. What has no source in Python has the first
+    lines of its documentation instead, marked so.
+
+    Returns
+    -------
+    tuple
+        Two texts, either of which is empty if it can't be found: at most 200 characters; at most 30 lines of at most
+        120 characters.
+    """
+    try:
+        if function not in _sources:
+            _sources[function] = _signature(function), _source(function)
+        return _sources[function]
+    except TypeError:  # no weak reference to it, or no hash: it is looked at again
+        return _signature(function), _source(function)
+    except Exception:  # whatever odd objects raise when they are hashed or compared
+        return "", ""
+
+
+def _or_nothing(text_of: Callable[[Any], str], function: Any) -> str:
+    try:
+        return text_of(function)
+    except Exception:  # a signature or a docstring may be any object
+        return ""
+
+
+def _signature(function: Any) -> str:
+    if not isinstance(function, FunctionType | partial) and isinstance(unwrapped(function), FunctionType):
+        function = unwrapped(function)
+    return _or_nothing(_signature_text, function)
+
+
+class _Text(str):
+    """A default as its preview: its own repr may be long, slow or raise."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
+
+
+def _signature_text(function: Any) -> str:
+    signature = inspect.signature(function)
+    short = [
+        each if each.default is each.empty else each.replace(default=_Text(preview(each.default).text))
+        for each in signature.parameters.values()
+    ]
+    text = without_addresses(str(signature.replace(parameters=short)))
+    if len(text) > SIGNATURE_CHARACTERS:
+        plain = [each.replace(annotation=each.empty) for each in short]
+        text = without_addresses(str(signature.replace(parameters=plain, return_annotation=signature.empty)))
+    return _shortened(text, SIGNATURE_CHARACTERS)
+
+
+def _source(function: Any) -> str:
+    return _or_nothing(_code, unwrapped(function)) or _or_nothing(_documentation, unwrapped(function))
+
+
+def _code(function: Any) -> str:
+    """Return the lines of a function; none if the lines that are there now are not those of a definition of it.
+
+    Found by the positions in its code: to parse the file, as ``inspect.getsource`` does, takes a hundred times longer.
+    """
+    if not isinstance(function, FunctionType):
+        function = getattr(type(function), "__call__", None)  # noqa: B004 - the method itself is wanted
+    if not isinstance(function, FunctionType):
+        return ""
+    code = function.__code__
+    lines = linecache.getlines(code.co_filename, function.__globals__)[code.co_firstlineno - 1 : _last_line(code)]
+    mark = "lambda" if code.co_name == "<lambda>" else f"def {code.co_name}"
+    return _first_lines(lines) if any(mark in line for line in lines) else ""
+
+
+def _last_line(code: CodeType) -> int:
+    """Return the last line of code, with the functions defined in it."""
+    inner = (_last_line(item) for item in code.co_consts if isinstance(item, CodeType))
+    own = (end for _, end, _, _ in code.co_positions() if end is not None)
+    return max((*inner, *own), default=code.co_firstlineno)
+
+
+def _documentation(function: Any) -> str:
+    """Return the first lines of the docstring of what is not written in Python; it may be as long as a book."""
+    if isinstance(function, FunctionType) or not callable(function):
+        return ""
+    lines = (inspect.getdoc(function) or "")[:10_000].splitlines()[: SOURCE_LINES - 1]
+    return "\n".join([_DOCUMENTED, *(_shortened(line.rstrip(), LINE_CHARACTERS) for line in lines)]) if lines else ""
+
+
+def _graph_lines(cg: CompGraph) -> str:
+    """Return the first functions of a pipeline's graph as lines: ``canny(image, low, high) -> edges``."""
+    return _first_lines([
+        f"{name}({', '.join(cg.func_inputs(name))}) -> {', '.join(cg.func_outputs(name)) or 'nothing'}"
+        for name in islice(cg.functions, SOURCE_LINES + 1)
+    ])  # fmt: skip
+
+
+def _first_lines(lines: Sequence[str]) -> str:
+    kept = [line.rstrip().expandtabs(4) for line in lines[:SOURCE_LINES]]
+    margin = min((len(line) - len(line.lstrip()) for line in kept if line), default=0)
+    short = [_shortened(line[margin:], LINE_CHARACTERS) for line in kept]
+    if len(lines) > SOURCE_LINES:
+        short[-1] = "…"
+    return "\n".join(short)
+
+
+def _shortened(text: str, characters: int) -> str:
+    return text if len(text) <= characters else text[: characters - 1] + "…"

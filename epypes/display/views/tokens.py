@@ -1,25 +1,48 @@
-"""What is to be seen of the tokens of a graph, and which of them get a thumbnail?"""
+"""The tokens of a view: their states, their previews, and which of them get a thumbnail."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from epypes.display.limits import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
-from epypes.display.previews.preview import Preview, finished, sketch
-from epypes.display.previews.ranges import kept_range
-from epypes.display.previews.raster import THUMBNAIL_BYTES
-from epypes.display.previews.shown import Look, Sketch
-from epypes.display.views.backdrops import RunSurroundings
-from epypes.display.views.graphview import TokenState, TokenView
+from epypes.display.previews.introspection import preview_context
+from epypes.display.previews.kept import ValuePreview, kept_previews, kept_range
+from epypes.display.previews.model import THUMBNAIL_BYTES, Look, Preview
+from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
+from epypes.display.views.graphview import GraphView, TokenState, TokenView
+from epypes.display.views.surroundings import RunSurroundings
 from epypes.run import Run
+from epypes.run.staleness import NOT_COMPUTED, is_same_value
 
 # What a picture of so few bytes shows is hardly seen; rather are some left out.
 _LEAST_BYTES: Final = 1_500
 _ELEMENT_CHARACTERS: Final = 150
 _POINT_CHARACTERS: Final = 12
+
+Rank = Callable[[str], Any]
+
+
+class _Found(NamedTuple):
+    shown: ValuePreview
+    value: Any
+    look: Look
+
+
+class _Known(NamedTuple):
+    """The previews that are kept of a program's tokens; in a nested look, each value is named only."""
+
+    kept: dict[tuple[str, bool], ValuePreview]
+    is_nested: bool
+
+    def find(self, name: str, value: Any, look: Look, *, is_first: bool = False) -> _Found:
+        key = name, is_first
+        shown = self.kept.get(key)
+        if shown is None or self.is_nested or not shown.is_of(value, look):
+            shown = ValuePreview(value, look, self.is_nested)
+            if shown.is_constant:
+                self.kept[key] = shown
+        return _Found(shown, value, look)
 
 
 class Room(NamedTuple):
@@ -32,116 +55,117 @@ class Room(NamedTuple):
 ROOM: Final = Room()
 
 
-def token_view(token: TokenView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> TokenView:
-    """Look at a token of a run; functions in ``stale`` are out of date since."""
-    if token.name in hparams or not run.tokens.is_computed(token.name):
-        return valueless_view(token, hparams, "not computed")
-    is_old = run.cg.digraph.producer.get(token.name) in stale
-    return _in_state(token, "stale" if is_old else "fresh")
+class HyperparameterValues(NamedTuple):
+    """The values of hyperparameters by token, and those that they had first."""
+
+    values: Mapping[str, Any]
+    first: Mapping[str, Any] = {}
 
 
-def valueless_view(token: TokenView, hparams: Mapping[str, Any], state: TokenState) -> TokenView:
-    """Look at a token of which only a hyperparameter's value is known; any other has this state."""
-    if token.name not in hparams:
-        return _in_state(token, state)
-    return replace(_in_state(token, "fresh"), role="hyperparameter")
-
-
-def _in_state(token: TokenView, state: TokenState) -> TokenView:
-    """Return a token in this state, unless it is left out."""
-    return token if token.state == "left out" else replace(token, state=state)
-
-
-def with_values(
-    tokens: Iterable[TokenView],
-    hparams: Mapping[str, Any],
-    first: Iterable[str] = (),
-    room: Room = ROOM,
+def token_views(
+    structure: GraphView,
+    hparams: HyperparameterValues,
+    state_of: Callable[[str], TokenState],
+    room: Room,
+    targets: Collection[str] = (),
+    run: Run | None = None,
 ) -> tuple[tuple[TokenView, ...], int]:
-    """Add the previews of hyperparameters; those of ``first`` get a thumbnail before others.
+    """Look at hyperparameters and, if there is one, at the values of a run.
 
-    Returns
-    -------
-    tuple
-        The tokens, and how many thumbnails were left out.
-    """
-    tokens, chosen = tuple(tokens), frozenset(first)
-    sketches = {token.name: sketch(hparams[token.name], Look(token.order)) for token in tokens if token.name in hparams}
-    return _with_previews(tokens, sketches, lambda name: name not in chosen, room)
-
-
-def with_run_values(
-    tokens: Iterable[TokenView],
-    run: Run,
-    hparams: Mapping[str, Any],
-    room: Room = ROOM,
-    seen: frozenset[str] = frozenset(),
-) -> tuple[tuple[TokenView, ...], int]:
-    """Add the previews of a run's values and of these hyperparameters.
-
-    Sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the others.
+    Of a run sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the
+    others. What can't have changed since the last picture is not looked at again.
 
     Parameters
     ----------
-    room
-        How many thumbnails there are at most, and how many characters they take together.
-    seen
-        The tokens that are seen at once, if only some are: they come before all others.
+    state_of
+        Returns the state of a token that is no hyperparameter.
+    targets
+        The tokens that get a thumbnail before others.
 
     Returns
     -------
     tuple
         The tokens, and how many thumbnails were left out.
     """
-    tokens = tuple(tokens)
-    program, values = run.tokens.program, run.tokens.values
-    sketches = {}
-    for token in tokens:
-        look = Look(token.order, partial(kept_range, program, token.name), RunSurroundings(run, token.name))
-        if token.name in hparams:
-            sketches[token.name] = sketch(hparams[token.name], look)
-        elif run.tokens.is_computed(token.name):
-            sketches[token.name] = sketch(values[program.slots[token.name]], look)
-    return _with_previews(tokens, sketches, _relevance(run, sketches, seen), room)
+    program = None if run is None else run.tokens.program
+    values = {**_computed(run), **hparams.values}
+    with preview_context() as is_nested:
+        known = _Known({} if program is None else kept_previews(program), is_nested)
+        found: dict[str, _Found] = {}
+        for token in structure.tokens:
+            if (name := token.name) in values:
+                look = Look(token.order)
+                if run is not None and program is not None:
+                    look = Look(token.order, partial(kept_range, program, name), RunSurroundings(run, name))
+                found[name] = known.find(name, values[name], look)
+        previews, dropped = _with_thumbnails(found, _rank(run, found, targets), room)
+        first = _first_texts(structure, hparams, known)
+    for each in found.values():
+        each.shown.sketch = None
+
+    def view(token: TokenView) -> TokenView:
+        name, is_hyperparameter = token.name, token.name in hparams.values
+        state = token.state if token.state == "left out" else "fresh" if is_hyperparameter else state_of(name)
+        role = "hyperparameter" if is_hyperparameter else token.role
+        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""))
+
+    return tuple(map(view, structure.tokens)), dropped
 
 
-def _relevance(run: Run, sketches: Mapping[str, Sketch], seen: frozenset[str]) -> Callable[[str], tuple[bool, int]]:
-    sinks, producer = frozenset(run.cg.sink_tokens), run.cg.digraph.producer
-    ran = {entry.function for entry in run.report.functions if entry.ran}
+def _computed(run: Run | None) -> dict[str, Any]:
+    if run is None:
+        return {}
+    pairs = zip(run.tokens.program.tokens, run.tokens.values, strict=True)
+    return {name: value for name, value in pairs if value is not NOT_COMPUTED}
 
-    def rank(token: str) -> int:
+
+def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]) -> Rank:
+    if run is None:
+        return lambda token: token not in targets
+    sinks, producer, ran = frozenset(run.cg.sink_tokens), run.cg.digraph.producer, run.report.durations_ns
+
+    def rank(token: str) -> tuple[bool, int]:
         if token in sinks:
-            return 0
-        if token not in producer and sketches[token].is_image:
-            return 1
-        return 2 if producer.get(token) in ran else 3
+            place = 0
+        elif token not in producer and found[token].shown.is_image:
+            place = 1
+        else:
+            place = 2 if producer.get(token) in ran else 3
+        return token not in targets, place
 
-    return lambda token: (bool(seen) and token not in seen, rank(token))
+    return rank
 
 
-def _with_previews(
-    tokens: tuple[TokenView, ...], sketches: Mapping[str, Sketch], rank: Callable[[str], Any], room: Room
-) -> tuple[tuple[TokenView, ...], int]:
-    """Finish the sketches: with a thumbnail those of the lowest ranks, in graph order, as far as there is room.
+def _first_texts(structure: GraphView, hparams: HyperparameterValues, known: _Known) -> dict[str, str]:
+    """Return the texts of the first values of hyperparameters that have another one now."""
+    texts = {}
+    for token in structure.tokens:
+        name = token.name
+        if name in hparams.first and name in hparams.values:
+            first, value = hparams.first[name], hparams.values[name]
+            if first is not value and not is_same_value(first, value):
+                shown = known.find(name, first, Look(token.order), is_first=True).shown
+                texts[name], shown.sketch = shown.brief.text, None
+    return texts
+
+
+def _with_thumbnails(found: Mapping[str, _Found], rank: Rank, room: Room) -> tuple[dict[str, Preview], int]:
+    """Return previews, with a thumbnail those of the lowest ranks, in graph order, as far as there is room.
 
     Each may take the same part of the room that is left, so that all of them are shown, if need be with less detail.
     """
-    by_rank = sorted((name for name, found in sketches.items() if found.may_be_drawn), key=rank)
+    by_rank = sorted((name for name, each in found.items() if each.shown.is_drawable), key=rank)
     chosen, left = by_rank[: min(room.thumbnails, room.characters // _characters(_LEAST_BYTES))], room.characters
-    previews = {name: found.shown for name, found in sketches.items()}
+    previews = {name: each.shown.brief for name, each in found.items()}
     for index, name in enumerate(chosen):
         share = (left // (len(chosen) - index) - _ELEMENT_CHARACTERS) * 3 // 4
-        previews[name] = finished(sketches[name], min(share, THUMBNAIL_BYTES))
-        left -= _cost(previews[name])
-    shown = tuple(replace(token, preview=previews.get(token.name)) for token in tokens)
-    return shown, len(by_rank) - len(chosen)
-
-
-def _cost(shown: Preview) -> int:
-    """Return how many characters a thumbnail takes in a picture."""
-    if shown.chart is not None:
-        return _ELEMENT_CHARACTERS + _POINT_CHARACTERS * sum(map(len, shown.chart.series))
-    return _characters(len(shown.picture.data)) if shown.picture is not None else 0
+        shown, value, look = found[name]
+        previews[name] = finished = shown.finished(value, look, min(share, THUMBNAIL_BYTES))
+        if finished.chart is not None:
+            left -= _ELEMENT_CHARACTERS + _POINT_CHARACTERS * sum(map(len, finished.chart.series))
+        elif finished.picture is not None:
+            left -= _characters(len(finished.picture.data))
+    return previews, len(by_rank) - len(chosen)
 
 
 def _characters(size: int) -> int:

@@ -1,29 +1,59 @@
-"""What is to be seen of a graph, a runner, a run, a plan or a pipeline, whoever paints it?
+"""The view of a graph, a runner, a run, a plan or a pipeline.
 
 Painters read the frozen GraphView and nothing else, so their colours and labels always agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, get_args
+from typing import Any, Final, Protocol, get_args
 
-from epypes.display.limits import CHARACTERS_OF_A_VERTEX, MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
-from epypes.display.views.graphview import Direction, GraphView
+from epypes.display.previews.short import reason
+from epypes.display.text import (
+    CHARACTERS_OF_A_VERTEX,
+    MOST_THUMBNAILS,
+    THUMBNAIL_CHARACTERS,
+    cut,
+    duration_text,
+    overhead_text,
+    short_name,
+)
+from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView, TokenState
 from epypes.display.views.groups import collapsed, groups_of, outside_tokens, twice_seen
-from epypes.display.views.pipelines import PipelineLike, in_pipeline
-from epypes.display.views.plans import plan_view
-from epypes.display.views.runs import run_structure, with_run
-from epypes.display.views.states import with_first, with_running
-from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import Room, valueless_view, with_values
-from epypes.errors import UnknownName
+from epypes.display.views.structure import structure_of
+from epypes.display.views.tokens import ROOM, HyperparameterValues, Room, token_views
+from epypes.errors import UnknownName, run_call
 from epypes.graph import CompGraph, names_of
-from epypes.run import CompGraphRunner, Plan, Run
+from epypes.run import CompGraphRunner, FunctionTime, Plan, Run
+from epypes.run.plan import chosen_branches, wanted_steps
+from epypes.wording import counted
 
 # What is left to thumbnails, however many vertices are seen twice.
 _LEAST_CHARACTERS: Final = THUMBNAIL_CHARACTERS // 3
+_NAMED: Final = 8
+_STAGE_KINDS: Final = ("queue", "loop", "function")
+_STAGE_STATES: Final = ("static", "running", "stopped", "failed")
+_NOTE_CHARACTERS: Final = 200
+_MOST_STAGES: Final = 12
+_MOST_NOTES: Final = 6
+
+
+class PipelineLike(Protocol):
+    """What is shown of a pipeline."""
+
+    @property
+    def name(self) -> str:
+        """Stands on the frame."""
+
+    @property
+    def runner(self) -> CompGraphRunner:
+        """Is shown inside the frame."""
+
+    @property
+    def stages(self) -> Any:
+        """Has ``before`` and ``after``: records with kind, name, state and notes."""
+
 
 Shown = CompGraph | CompGraphRunner | Run | Plan | PipelineLike
 
@@ -61,11 +91,9 @@ def view(
             raise UnknownName("group", name, groups, "in this picture")
     closed = {name: inside for name, inside in groups.items() if collapse and name not in opened}
     characters = THUMBNAIL_CHARACTERS - CHARACTERS_OF_A_VERTEX * twice_seen(cg, closed)
-    whole = _whole(shown, Room(thumbnails, max(characters, _LEAST_CHARACTERS)), closed)
-    graph = collapsed(replace(whole, direction=direction), closed)
-    if graph.draws_edges:
-        return graph
-    return replace(graph, caption=with_caption(f"{len(graph.edges):,} edges, too many to be drawn", graph))
+    graph = _whole(shown, Room(thumbnails, max(characters, _LEAST_CHARACTERS)), closed)
+    graph = collapsed(graph if graph.direction == direction else replace(graph, direction=direction), closed)
+    return graph if graph.draws_edges else _captioned(graph, f"{len(graph.edges):,} edges, too many to be drawn")
 
 
 def _require_options(direction: object, thumbnails: object, collapse: object) -> None:
@@ -98,53 +126,188 @@ def _graph_of(shown: Any) -> CompGraph:
 def _whole(shown: Shown, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     """Look at all functions; thumbnails that are in closed groups are dropped first."""
     if isinstance(shown, CompGraph):
-        return _graph_view(shown, room)
+        # Tokens with a default are shown as the hyperparameters that a runner makes of them.
+        structure, hparams = structure_of(shown, {}, ()), HyperparameterValues(shown.defaults)
+        return replace(structure, tokens=token_views(structure, hparams, lambda name: "static", room)[0])
+    if isinstance(shown, Plan):
+        return plan_view(shown, room)
+    if isinstance(shown, Run):
+        hparams = HyperparameterValues(shown.hyperparameters, shown.first_hyperparameters)
+        return _run_view(shown, _run_structure(shown), hparams, frozenset(), room, closed)
     if isinstance(shown, CompGraphRunner):
         return _runner_view(shown, room, closed)
-    if isinstance(shown, Plan):
-        return with_first(plan_view(shown, room), shown.hyperparameters, shown.first_hyperparameters)
-    if isinstance(shown, Run):
-        return _run_view(shown, room, closed)
-    return in_pipeline(_runner_view(shown.runner, room, closed), shown)
+    return _in_pipeline(_runner_view(shown.runner, room, closed), shown)
 
 
-def _run_view(run: Run, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
-    structure = run_structure(run)
-    graph = with_run(structure, run, run.hyperparameters, frozenset(), room, _seen(structure, closed))
-    return with_first(graph, run.hyperparameters, run.first_hyperparameters)
+def _captioned(graph: GraphView, text: str, **changes: Any) -> GraphView:
+    """Return a view whose caption begins with this text and goes on with the one that it has."""
+    return replace(graph, caption=f"{text}. {graph.caption}" if graph.caption else text, **changes)
 
 
-def _seen(structure: GraphView, closed: Mapping[str, Sequence[str]]) -> Sequence[str]:
-    if not closed:
-        return ()
-    outside = outside_tokens(structure, closed)
-    return [token.name for token in structure.tokens if token.name in outside]
+# -- runs and runners ----------------------------------------------------------------------------------------------
 
 
-def _graph_view(cg: CompGraph, room: Room) -> GraphView:
-    """Look at a graph; tokens with a default are shown as the hyperparameters that a runner makes of them."""
-    structure = structure_of(cg, {}, ())
-    every = [valueless_view(token, cg.defaults, "static") for token in structure.tokens]
-    tokens, _ = with_values(every, cg.defaults, (), room)
-    return replace(structure, tokens=tokens)
+def _run_structure(run: Run) -> GraphView:
+    """Look at a run's graph with the branches that it chose; what ran is not left out, whatever it was asked for."""
+    program, values = run.tokens.program, run.tokens.values
+    wanted = wanted_steps(program, values, ())
+    ran = run.report.durations_ns
+    left_out = [step.name for step in program.steps if wanted and not wanted[step.place] and step.name not in ran]
+    return structure_of(run.cg, chosen_branches(program, values), left_out)
+
+
+def _run_view(
+    run: Run,
+    structure: GraphView,
+    hparams: HyperparameterValues,
+    stale: frozenset[str],
+    room: Room,
+    closed: Mapping[str, Sequence[str]],
+) -> GraphView:
+    """Add a run to a graph's structure; ``stale`` are functions out of date since the run."""
+    steps, report = run.tokens.program.steps, run.report
+    stale |= {steps[index].name for index in run.tokens.stale}
+    seen = outside_tokens(structure, closed) if closed else ()
+    producer = run.cg.digraph.producer
+
+    def state_of(token: str) -> TokenState:
+        if not run.tokens.is_computed(token):
+            return "not computed"
+        return "stale" if producer.get(token) in stale else "fresh"
+
+    tokens, dropped = token_views(structure, hparams, state_of, room, seen, run)
+    overhead = f"{overhead_text(report.side_by_side)} {duration_text(report.overhead_ns)}"
+    caption = f"{duration_text(report.total_ns)} in all, {overhead}"
+    if dropped:
+        caption += f"; {dropped} thumbnails left out to keep the picture small"
+    function_view = _run_function_view(run, stale)
+    return _captioned(structure, caption, functions=tuple(map(function_view, structure.functions)), tokens=tokens)
+
+
+def _run_function_view(run: Run, stale: Collection[str]) -> Callable[[FunctionView], FunctionView]:
+    report, failure = run.report, run.failure
+    entries: Mapping[str, FunctionTime] = {entry.function: entry for entry in report.functions}
+    total_ns = max(report.total_ns, 1)
+
+    def function_view(function: FunctionView) -> FunctionView:
+        name, entry = function.name, entries.get(function.name)
+        if failure and failure.function == name:
+            duration_ns = entry.duration_ns if entry else None
+            return function._replace(state="failed", duration_ns=duration_ns, message=failure.message or failure.kind)
+        if function.state == "left out":
+            return function
+        if name in stale:
+            made = run.cg.func_outputs(name)
+            is_new = made and not any(map(run.tokens.is_computed, made))
+            return function._replace(state="not run" if is_new else "stale")
+        if entry is None or not entry.ran:
+            return function._replace(state="reused")
+        share = entry.duration_ns / total_ns
+        return function._replace(state="ran", duration_ns=entry.duration_ns, share=share)
+
+    return function_view
 
 
 def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     # First, so that what ends meanwhile shows as running, not as never run.
     running, last, plan = runner.running, runner.last, runner.plan()
-    graph = _between_runs(last, plan, room, closed)
-    return with_running(with_first(graph, plan.hyperparameters, plan.first_hyperparameters), running)
-
-
-def _between_runs(last: Run | None, plan: Plan, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     structure = structure_of(plan.cg, plan.branches, plan.left_out)
+    hparams = HyperparameterValues(plan.hyperparameters, plan.first_hyperparameters)
     if last is not None:
-        seen = _seen(structure, closed)
-        return with_run(structure, last, plan.hyperparameters, frozenset(plan.order), room, seen)
+        graph = _run_view(last, structure, hparams, frozenset(plan.order), room, closed)
+    else:
+        functions = tuple(
+            function if function.state == "left out" else function._replace(state="not run")
+            for function in structure.functions
+        )
+        tokens, _ = token_views(structure, hparams, lambda name: "not computed", room)
+        graph = _captioned(structure, "not run yet", functions=functions, tokens=tokens)
+    return _with_running(graph, running) if running else graph
+
+
+def _with_running(graph: GraphView, running: Sequence[str]) -> GraphView:
     functions = tuple(
-        function if function.state == "left out" else replace(function, state="not run")
-        for function in structure.functions
+        function._replace(state="running", message="", duration_ns=None, share=0.0)
+        if function.name in running
+        else function
+        for function in graph.functions
     )
-    every = [valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens]
-    tokens, _ = with_values(every, plan.hyperparameters, (), room)
-    return replace(structure, functions=functions, tokens=tokens, caption=with_caption("not run yet", structure))
+    more = f" and {len(running) - _NAMED} more" * (len(running) > _NAMED)
+    return _captioned(graph, f"running: {', '.join(map(short_name, running[:_NAMED]))}{more}", functions=functions)
+
+
+# -- plans ---------------------------------------------------------------------------------------------------------
+
+
+def plan_view(plan: Plan, room: Room = ROOM) -> GraphView:
+    """Look at a plan; hyperparameters may be images, of which so many are shown."""
+    structure, missing = structure_of(plan.cg, plan.branches, plan.left_out), frozenset(plan.missing)
+    hparams = HyperparameterValues(plan.hyperparameters, plan.first_hyperparameters)
+    tokens, _ = token_views(
+        structure, hparams, lambda name: "missing" if name in missing else "static", room, plan.targets
+    )
+    functions = tuple(_planned_view(function, plan) for function in structure.functions)
+    return _captioned(structure, _plan_caption(plan), functions=functions, tokens=tokens)
+
+
+def _planned_view(function: FunctionView, plan: Plan) -> FunctionView:
+    name = function.name
+    if function.state == "left out":
+        return function._replace(
+            message="not needed for these targets" if plan.targets else "only for a branch that is not chosen"
+        )
+    if name in plan.placeholders:
+        return function._replace(state="missing", message="still to be written; ep.extend fills it")
+    if name in plan.why:
+        return function._replace(state="planned", message=plan.why[name])
+    return function._replace(state="reused", message="up to date")
+
+
+def _plan_caption(plan: Plan) -> str:
+    placeholders = len(plan.placeholders)
+    parts = [f"{counted(len(plan.order) - placeholders, 'function')} to run, {len(plan.reused)} reused"]
+    if plan.left_out:
+        parts.append(f"{len(plan.left_out)} left out")
+    if placeholders:
+        parts.append(f"{placeholders} still to be written")
+    text = ", ".join(parts)
+    if plan.targets:
+        text += f"; asked for: {_some(plan.targets)}"
+    if plan.missing:
+        text += f"; missing: {_some(plan.missing)}: call {run_call(plan.missing[:_NAMED])}"
+    return text
+
+
+def _some(names: tuple[str, ...]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
+
+
+# -- pipelines -----------------------------------------------------------------------------------------------------
+
+
+def _in_pipeline(graph: GraphView, pipeline: PipelineLike) -> GraphView:
+    """Return the view of a pipeline's graph with the frame and the stages around it.
+
+    Stages that can't be had are left out: they come from properties that users may override.
+    """
+    title = str(pipeline.name) or "pipeline"
+    try:
+        stages = pipeline.stages
+        before, after = _stage_views(stages.before), _stage_views(stages.after)
+    except Exception as error:
+        caption = f"its stages can't be read: {reason(error, _NOTE_CHARACTERS)}"
+        return replace(graph, title=title, caption=". ".join(filter(None, (graph.caption, caption))))
+    return replace(graph, title=title, before=before, after=after)
+
+
+def _stage_views(stages: Sequence[Any]) -> tuple[StageView, ...]:
+    return tuple(
+        StageView(
+            stage.kind if stage.kind in _STAGE_KINDS else "function",
+            cut(str(stage.name), _NOTE_CHARACTERS),
+            stage.state if stage.state in _STAGE_STATES else "static",
+            tuple(cut(str(note), _NOTE_CHARACTERS) for note in tuple(stage.notes)[:_MOST_NOTES]),
+        )
+        for stage in stages[:_MOST_STAGES]
+    )

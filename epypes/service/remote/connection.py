@@ -322,7 +322,7 @@ class Connection:
         return f"<p>{escape(state)}</p><table>{''.join(cells)}</table>"
 
     def _read_view(self) -> GraphView:
-        from epypes.display.views.jsonview import from_json
+        from epypes.display.views.graphview import from_json
 
         try:
             return from_json(self.view())

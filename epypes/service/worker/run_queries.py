@@ -193,7 +193,7 @@ def _figure(shown: Run | CompGraphRunner) -> Figure:
 
 
 def _json_of(figure: Figure) -> bytes:
-    from epypes.display.views.jsonview import to_json
+    from epypes.display.views.graphview import to_json
 
     return json.dumps(to_json(figure.view)).encode()
 

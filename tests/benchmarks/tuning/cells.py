@@ -34,7 +34,7 @@ Echo()
 """
 _GRAPH = """
 import cv2, threading, ipywidgets, matplotlib.pyplot as plt, numpy as np, epypes as ep
-from epypes.display.previews.raster import encode_image
+from epypes.display.previews.encoding import encode_image
 from epypes_widgets import tune
 from skimage import data
 from tests.benchmarks.work import edge_graph

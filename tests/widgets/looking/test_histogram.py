@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 import epypes as ep
 from epypes.display import Backdrop, reset_display_ranges
-from epypes.display.previews.ranges import display_range
+from epypes.display.previews.images import display_range
 from epypes_widgets.looking import histogram, histogram_of
 
 

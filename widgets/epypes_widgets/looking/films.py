@@ -10,10 +10,9 @@ from typing import Any, Final
 
 from epypes.display import is_image
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.imagekinds import image_kind, sampled
-from epypes.display.previews.kinds import is_array
-from epypes.display.previews.looking import silent_numpy
-from epypes.display.previews.raster import encode_small, pillow_image
+from epypes.display.previews.encoding import encode_small, pillow_image
+from epypes.display.previews.images import image_kind, sampled
+from epypes.display.previews.introspection import is_array, silent_numpy
 from epypes.errors import PayloadError, UnknownName
 from epypes.graph import colour_order
 from epypes_widgets.places import Tunable

@@ -11,8 +11,8 @@ import math
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display import Backdrop, is_image, scene_of
-from epypes.display.previews.imagekinds import image_kind, one_channel, sampled
-from epypes.display.previews.looking import silent_numpy
+from epypes.display.previews.images import image_kind, one_channel, sampled
+from epypes.display.previews.introspection import silent_numpy
 from epypes.run import Run
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from weakref import ReferenceType, WeakKeyDictionary, ref
 
 from epypes.display import Scene, is_image
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.imagekinds import image_kind, one_channel, sampled
-from epypes.display.previews.looking import silent_numpy
+from epypes.display.previews.images import image_kind, one_channel, sampled
+from epypes.display.previews.introspection import silent_numpy
 from epypes.graph import colour_order
 from epypes.images import Order
 from epypes.run import Run

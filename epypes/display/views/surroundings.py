@@ -1,27 +1,29 @@
-"""Over which images of a run can what was found in them be drawn?
+"""The images of a run that what was found in them is drawn over, and scenes at full size.
 
-The graph tells: a token is made from the tokens that its function takes, those from others, and so on.
+The graph shows them: a token is made from the tokens that its function takes, those from others, and so on.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.features import are_keypoints
-from epypes.display.previews.imagekinds import image_kind, is_image, sampled
-from epypes.display.previews.ranges import Range, kept_range
-from epypes.display.previews.shown import Backdrop
+from epypes.display.previews.images import Range, image_kind, is_image, sampled
+from epypes.display.previews.kept import kept_range
+from epypes.display.previews.model import Backdrop, Look, Marks, Most, Scene, Surroundings
+from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
 from epypes.run import Run
 
 _MOST_TOKENS: Final = 500
 
 
-class RunSurroundings:
+class RunSurroundings(Surroundings):
     """The images and keypoints that a token of a run was made from.
 
     Parameters
@@ -35,9 +37,7 @@ class RunSurroundings:
     """
 
     def __init__(self, run: Run, token: str, range_of: Callable[[str, Any], Range] | None = None) -> None:
-        self._run, self._token = run, token
-        self._range_of = partial(kept_range, run.tokens.program) if range_of is None else range_of
-        self._digraph = run.cg.digraph
+        self._run, self._token, self._range_of = run, token, range_of
 
     def nearest_image(self) -> Backdrop | None:
         """Return the nearest image among the token's ancestors; of its size rather a photograph than a mask."""
@@ -87,13 +87,15 @@ class RunSurroundings:
     def _around(self, token: str) -> Iterator[str]:
         """Yield a token, what its function made beside it, and their ancestors."""
         yield token
-        maker = self._digraph.producer.get(token)
+        maker = self._run.cg.digraph.producer.get(token)
         if maker is not None:
-            yield from (name for name in self._digraph.outputs[maker] if name != token and self._is_fresh(name))
+            yield from (name for name in self._run.cg.digraph.outputs[maker] if name != token and self._is_fresh(name))
         for name in self._ancestors(token):
             yield name
-            maker = self._digraph.producer.get(name)
-            yield from () if maker is None else (near for near in self._digraph.outputs[maker] if self._is_fresh(near))
+            maker = self._run.cg.digraph.producer.get(name)
+            yield from (
+                () if maker is None else (near for near in self._run.cg.digraph.outputs[maker] if self._is_fresh(near))
+            )
 
     def _ancestors(self, token: str) -> Iterator[str]:
         """Yield the tokens that a token was made from that have a value, the nearest first."""
@@ -106,8 +108,8 @@ class RunSurroundings:
                     yield name
 
     def _inputs(self, token: str) -> tuple[str, ...]:
-        maker = self._digraph.producer.get(token)
-        return tuple(self._digraph.inputs[maker]) if maker is not None else ()
+        maker = self._run.cg.digraph.producer.get(token)
+        return tuple(self._run.cg.digraph.inputs[maker]) if maker is not None else ()
 
     def _is_fresh(self, token: str) -> bool:
         return self._run.tokens.is_computed(token) and not self._run.tokens.is_stale(token)
@@ -125,4 +127,55 @@ class RunSurroundings:
 
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
-        return Backdrop(value, colour_order(self._run.cg, token), self._range_of(token, value), token)
+        range_of = self._range_of or partial(kept_range, self._run.tokens.program)
+        return Backdrop(value, colour_order(self._run.cg, token), range_of(token, value), token)
+
+
+def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:
+    """Return a token as an image, and its marks if it is what was found in one; never raises for a value.
+
+    Parameters
+    ----------
+    run
+        Its tokens' values.
+    token
+        An image, what a preview function shows as an image, or keypoints, contours, boxes, segments, points, matches.
+    most
+        How many marks there are at most; without, as many as on a thumbnail.
+    had_marks
+        Whether an earlier value of the token had marks: where nothing is found any more, the image alone is left.
+
+    Returns
+    -------
+    Scene or None
+        None if the token has no such picture, or no value that is up to date.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from epypes import CompGraph, CompGraphRunner
+    >>> cg = CompGraph({"find": lambda image: np.array([[[20, 10]], [[30, 10]]])}, {"find": ("image", "points")})
+    >>> scene = scene_of(CompGraphRunner(cg).run(image=np.eye(64)), "points")
+    >>> scene.backdrop.name, scene.what, scene.marks.points.tolist()
+    ('image', 'points', [[20.0, 10.0], [30.0, 10.0]])
+    """
+    program, tokens = run.tokens.program, run.tokens
+    if not tokens.is_computed(token) or tokens.is_stale(token):
+        return None
+    value, order = tokens.values[program.slots[token]], colour_order(run.cg, token)
+    if is_image(value):
+        array = plain_array(value)
+        return Scene(Backdrop(array, order, kept_range(program, token, array), token))
+    around = RunSurroundings(run, token)
+    look = Look(order, partial(kept_range, program, token), around, most or Most())
+    scene = scene_in(sketch(value, look))
+    if scene is None:
+        return _without_marks(around) if had_marks else None
+    return scene if scene.backdrop.name else replace(scene, backdrop=replace(scene.backdrop, name=token))
+
+
+def _without_marks(around: RunSurroundings) -> Scene | None:
+    import numpy as np
+
+    backdrop = around.nearest_image()
+    return None if backdrop is None else Scene(backdrop, Marks(np.empty((0, 2))))

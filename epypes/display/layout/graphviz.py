@@ -1,4 +1,4 @@
-"""How is Graphviz asked where vertices and edges go?
+"""Layouts by Graphviz.
 
 The graphviz package writes the DOT source, which holds sizes and edges but no names and no values. pygraphviz has
 Graphviz inside its wheel; where it is missing, ``dot`` on the PATH serves.
@@ -7,7 +7,6 @@ Graphviz inside its wheel; where it is missing, ``dot`` on the PATH serves.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
 import threading
@@ -21,16 +20,6 @@ _POINTS_PER_INCH: Final = 72.0
 _DOT_TIMEOUT_S: Final = 30.0
 # Graphviz keeps global state, so only one thread may be in it.
 _engine_lock = threading.Lock()
-
-
-def _renew_lock() -> None:
-    """Forget a lock that another thread of the parent process held, and will never release here."""
-    global _engine_lock
-    _engine_lock = threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew_lock)
 
 
 def routed_layout(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int]) -> Layout:

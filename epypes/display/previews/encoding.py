@@ -1,22 +1,23 @@
-"""How does an array become the bytes of a JPEG or PNG?
+"""Arrays as the bytes of a JPEG or PNG.
 
 Pillow encodes: it comes with every notebook that has matplotlib, and unlike OpenCV's it has one wheel, so no OpenCV
-build is forced on anybody. Three channels are BGR, as in OpenCV, unless the caller
-says rgb.
+build is forced on anybody. Masks are packed here: Pillow takes five times as long, and a mask of 1 MP is written ten
+times while a slider is dragged for a moment. Three channels are BGR, as in OpenCV, unless the caller says rgb.
 """
 
 from __future__ import annotations
 
+import colorsys
+import functools
 import io
+import struct
+import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.bitmap import bitmap_png
-from epypes.display.previews.imagekinds import image_kind, is_image, is_mask, one_channel, sampled
-from epypes.display.previews.labels import label_picture
-from epypes.display.previews.looking import silent_numpy
-from epypes.display.previews.ranges import Range, display_range
+from epypes.display.previews.images import Range, display_range, image_kind, is_mask, one_channel, sampled
+from epypes.display.previews.introspection import silent_numpy
+from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -24,44 +25,22 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from PIL import Image
 
+    from epypes.display.previews.model import Array
     from epypes.images import Order
 
-    Array = npt.NDArray[Any]
-
-__all__ = ["THUMBNAIL_BYTES", "THUMBNAIL_PX", "Picture", "encode_image", "encode_small", "is_image", "pillow_image"]
-
-THUMBNAIL_PX: Final = 128
-THUMBNAIL_BYTES: Final = 5_000
 JPEG_QUALITY: Final = 80
 _QUALITIES: Final = (68, 55, 42)
-# Of a line, half or a quarter is left by mean: it is made brighter again. Few greys, which compress well.
-_GREYS: Final = 4
-_BRIGHTER: Final = [round((_GREYS - 1) * (level / 255) ** 0.5) for level in range(256)]
 _COLOURS: Final = 48
 _LEAST_SIDE_PX: Final = 16
-_MOST_POOLED_PX: Final = 16_000_000
-# So many pixels of a very large mask, along each side, make one of the thumbnail.
-_SAMPLED: Final = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An encoded picture.
+@functools.cache
+def pillow() -> Any:
+    """Return Pillow's module ``Image``."""
+    with optional_import():
+        from PIL import Image
 
-    Attributes
-    ----------
-    data
-        The bytes of the file.
-    media_type
-        ``"image/jpeg"`` or ``"image/png"``.
-    width, height
-        Its size, in pixels.
-    """
-
-    data: bytes = field(repr=False)
-    media_type: str
-    width: int
-    height: int
+    return Image
 
 
 def encode_image(
@@ -115,7 +94,7 @@ def pillow_image(array: Array, max_side_px: int | None, order: Order, ends: Rang
 def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES, *, has_small_marks: bool = False) -> Picture:
     """Encode a thumbnail within so many bytes: at a lower quality if need be, then smaller.
 
-    JPEG has colours at half the size, which makes small marks grey, unless they are said to be there.
+    JPEG has colours at half the size, which makes small marks grey, unless they are known to be there.
     """
     encoded = _save(picture, full_colours=has_small_marks)
     for attempt, quality in _attempts(picture):
@@ -127,17 +106,15 @@ def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES, *, has
 
 def _attempts(picture: Image.Image) -> Iterator[tuple[Image.Image, int]]:
     """Yield pictures of ever fewer bytes, with the quality of their JPEG."""
-    with optional_import():
-        from PIL import Image
-
-    sharp = Image.Resampling.NEAREST if picture.mode in ("1", "P") else Image.Resampling.BOX
+    pil = pillow()
+    sharp = pil.Resampling.NEAREST if picture.mode in ("1", "P") else pil.Resampling.BOX
     if picture.mode in ("L", "RGB"):
         for quality in _QUALITIES:
             yield picture, quality
     small = picture
     while max(small.size) * 3 // 4 >= _LEAST_SIDE_PX:
         if picture.mode == "RGBA":
-            yield small.quantize(_COLOURS, Image.Quantize.FASTOCTREE), 0
+            yield small.quantize(_COLOURS, pil.Quantize.FASTOCTREE), 0
         small = picture.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)), sharp)
         yield small, _QUALITIES[-1]
 
@@ -168,36 +145,45 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
 
 
 def _pillow(image: npt.NDArray[np.uint8], order: Order) -> Image.Image:
-    with optional_import():
-        from PIL import Image
-
-    size = (image.shape[1], image.shape[0])
-    if image.ndim == 2:
-        return Image.frombuffer("L", size, image, "raw", "L", 0, 1)
-    if image.shape[2] == 3:
-        return Image.frombuffer("RGB", size, image, "raw", order.upper(), 0, 1)
-    return Image.frombuffer("RGBA", size, image, "raw", f"{order.upper()}A", 0, 1)
+    mode = "L" if image.ndim == 2 else "RGB" if image.shape[2] == 3 else "RGBA"
+    raw = "L" if mode == "L" else f"{order.upper()}{mode[3:]}"
+    picture: Image.Image = pillow().frombuffer(mode, image.shape[1::-1], image, "raw", raw, 0, 1)
+    return picture
 
 
 def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
     if max_side_px is None or max(picture.size) <= max_side_px:
         return picture
-    with optional_import():
-        from PIL import Image
-
     scale = max_side_px / max(picture.size)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
-    return picture.resize(size, Image.Resampling.BOX)
+    return picture.resize(size, pillow().Resampling.BOX)
+
+
+def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bool = False) -> Picture:
+    stream = io.BytesIO()
+    kind = "JPEG" if picture.mode in ("L", "RGB") else "PNG"
+    if kind == "JPEG":
+        picture.save(stream, kind, quality=quality, subsampling=0 if full_colours else -1)
+    else:
+        picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 6)
+    return Picture(stream.getvalue(), f"image/{kind.lower()}", picture.width, picture.height)
+
+
+# -- masks -------------------------------------------------------------------------------------------------------------
+
+# Of a line, half or a quarter is left by mean: it is made brighter again. Few greys, which compress well.
+_GREYS: Final = 4
+_BRIGHTER: Final = [round((_GREYS - 1) * (level / 255) ** 0.5) for level in range(256)]
+_MOST_POOLED_PX: Final = 16_000_000
+# So many pixels of a very large mask, along each side, make one of the thumbnail.
+_SAMPLED: Final = 4
 
 
 def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     """Shrink to twice the size by maximum, and from there by mean: thin lines stay, and stay thinner than areas."""
-    with optional_import():
-        from PIL import Image
-
     doubled = _mask_picture(mask, 2 * max_side_px).convert("L")
     indices = _resized(doubled, max_side_px).point(_BRIGHTER)
-    picture = Image.frombytes("P", indices.size, indices.tobytes())
+    picture: Image.Image = pillow().frombytes("P", indices.size, indices.tobytes())
     picture.putpalette([level * 255 // (_GREYS - 1) for level in range(_GREYS) for _ in "rgb"])
     return picture
 
@@ -208,10 +194,8 @@ def _is_thumbnail(image: Array, max_side_px: int | None) -> bool:
 
 
 def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
-    with optional_import():
-        from PIL import Image
-
-    return Image.fromarray(_mask_bits(mask, max_side_px)).convert("1")
+    picture: Image.Image = pillow().fromarray(_mask_bits(mask, max_side_px))
+    return picture.convert("1")
 
 
 def _mask_bits(mask: Array, max_side_px: int | None) -> npt.NDArray[np.bool_]:
@@ -244,11 +228,66 @@ def _pooled(bits: Array, pool: int) -> Array:
     return np.concatenate([pooled, np.bitwise_or.reduce(rest, axis=0, keepdims=True)]) if len(rest) else pooled
 
 
-def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bool = False) -> Picture:
-    stream = io.BytesIO()
-    kind = "JPEG" if picture.mode in ("L", "RGB") else "PNG"
-    if kind == "JPEG":
-        picture.save(stream, kind, quality=quality, subsampling=0 if full_colours else -1)
-    else:
-        picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 6)
-    return Picture(stream.getvalue(), f"image/{kind.lower()}", picture.width, picture.height)
+_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_DEPTH: Final = 1
+_GRAYSCALE: Final = 0
+# Masks are runs: longer matches than those of one byte are rarely found, and looking for them takes most of the time.
+_LEVEL: Final = 1
+_MEMORY: Final = 9
+
+
+def bitmap_png(mask: Array) -> bytes:
+    """Return a mask as a grayscale PNG whose pixels are black and white.
+
+    Parameters
+    ----------
+    mask
+        (height, width), bool or bytes; what is not 0 is white.
+    """
+    import numpy as np
+
+    height, width = mask.shape
+    packed = np.packbits(mask, axis=1)
+    rows = np.zeros((height, packed.shape[1] + 1), np.uint8)
+    rows[:, 1:] = packed  # each row begins with its filter, which is none
+    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, zlib.MAX_WBITS, _MEMORY, zlib.Z_RLE)
+    data = packer.compress(rows.tobytes()) + packer.flush()
+    header = struct.pack(">IIBBBBB", width, height, _DEPTH, _GRAYSCALE, 0, 0, 0)
+    return _SIGNATURE + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+# -- labels ------------------------------------------------------------------------------------------------------------
+
+# Byte 0 is black, for label 0; byte 255 is white, for what is negative, as the borders of cv2.watershed.
+_LABEL_COLOURS: Final = 254
+_WHITE: Final = 255
+_GOLDEN: Final = 0.618033988749895
+# Neighbouring numbers get hues far apart, and four numbers in a row differ in brightness, too.
+_TONES: Final = ((0.60, 0.95), (0.85, 0.75), (0.45, 1.00), (0.75, 0.88))
+
+
+@functools.cache
+def palette() -> bytes:
+    """Return 256 colours of three bytes."""
+    colours = bytearray(3)
+    for index in range(_LABEL_COLOURS):
+        saturation, brightness = _TONES[index % len(_TONES)]
+        colour = colorsys.hsv_to_rgb((0.58 + index * _GOLDEN) % 1.0, saturation, brightness)
+        colours += bytes(round(255 * channel) for channel in colour)
+    return bytes(colours) + b"\xff\xff\xff"
+
+
+def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
+    """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
+    import numpy as np
+
+    stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
+    kept = labels[::stride, ::stride]
+    numbers = np.where(kept > 0, (kept.astype(np.int64) - 1) % _LABEL_COLOURS + 1, np.where(kept < 0, _WHITE, 0))
+    picture: Image.Image = pillow().fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
+    picture.putpalette(palette())
+    return picture

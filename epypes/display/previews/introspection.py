@@ -1,4 +1,4 @@
-"""Of which kind is a value, found without running a line of its class?
+"""Safe introspection: the kind and the parts of a value, without running a line of its class.
 
 A class may say of itself what it likes, and compute or raise when it is asked. So Python's own slots are read, and
 what is known of a value is only what its classes are, by identity.
@@ -6,16 +6,23 @@ what is known of a value is only what its classes are, by identity.
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
-from types import GetSetDescriptorType, MappingProxyType, MemberDescriptorType
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from types import FunctionType, GetSetDescriptorType, MappingProxyType, MemberDescriptorType, SimpleNamespace
 from typing import Any, Final
 
-_name_of: Final = type.__dict__["__name__"].__get__
-_qualified_name_of: Final = type.__dict__["__qualname__"].__get__
+# The name of a class, its name within its module, and the class with its parents in the order in which Python asks
+# them. These never raise, whatever a metaclass says.
+kind_name: Final[Callable[[type], str]] = type.__dict__["__name__"].__get__
+qualified_name: Final[Callable[[type], str]] = type.__dict__["__qualname__"].__get__
+parents: Final[Callable[[type], tuple[type, ...]]] = type.__dict__["__mro__"].__get__
+# A text whose class is str, whatever a subclass makes of its methods.
+plain_text: Final[Callable[[str], str]] = str.__str__
 _module_of: Final = type.__dict__["__module__"].__get__
-_parents_of: Final = type.__dict__["__mro__"].__get__
 _attributes_of: Final = type.__dict__["__dict__"].__get__
 # Their length is known to Python itself. Subclasses may compute theirs, and are asked for that of their parent.
 _SIZED: Final[tuple[Any, ...]] = (
@@ -27,18 +34,6 @@ _MAPPINGS: Final[tuple[Any, ...]] = (OrderedDict, dict, MappingProxyType)
 _PANDAS: Final = ("DataFrame", "Series", "Index")
 
 
-def kind_name(kind: type) -> str:
-    """Return the name of a class; never raises."""
-    name: str = _name_of(kind)
-    return name
-
-
-def qualified_name(kind: type) -> str:
-    """Return the name of a class within its module; never raises."""
-    name: str = _qualified_name_of(kind)
-    return name
-
-
 def dotted_name(kind: type) -> str:
     """Return where a class is from, ``"package.module.Pose"``; never raises."""
     try:
@@ -47,15 +42,9 @@ def dotted_name(kind: type) -> str:
         return qualified_name(kind)
 
 
-def parents(kind: type) -> tuple[type, ...]:
-    """Return a class and those that it is made from, in the order in which Python asks them."""
-    found: tuple[type, ...] = _parents_of(kind)
-    return found
-
-
 def declared(kind: type, name: str) -> Any:
     """Return an attribute as it stands in a class or the nearest of its parents; None if there is none."""
-    for parent in _parents_of(kind):
+    for parent in parents(kind):
         attributes = _attributes_of(parent)
         if name in attributes:
             return attributes[name]
@@ -74,11 +63,11 @@ def stored(value: Any, name: str) -> tuple[Any, ...]:
 
 
 def is_of(value: Any, package: str, *names: str) -> bool:
-    """Whether a value is of one of these classes of a package, that somebody else has imported by now."""
+    """Whether a value is of one of these classes of a package, if that is imported by now."""
     module = sys.modules.get(package)
     if module is None:
         return False
-    ancestors = _parents_of(type(value))
+    ancestors = parents(type(value))
     for name in names:
         known = getattr(module, name, None)
         # By identity, since a class may say of itself that it equals another.
@@ -117,11 +106,6 @@ def pairs_in(value: Any) -> Iterator[tuple[Any, Any]]:
     return iter(known.items(value))
 
 
-def plain_text(text: str) -> str:
-    """Return a text whose class is str, whatever a subclass makes of its methods."""
-    return str.__str__(text)
-
-
 def _first_of(kinds: Iterable[Any], value: Any) -> Any:
     kind = type(value)
     for known in kinds:
@@ -144,3 +128,60 @@ def sorted_items(value: Any, written: Callable[[Any], str], most: int = 2_000) -
         return kind_name(type(item)), is_plain, item if is_plain else written(item)
 
     return sorted(items_in(value), key=rank)
+
+
+_ATTRIBUTES: Final[Any] = declared(SimpleNamespace, "__dict__")
+
+
+def fields_of(value: Any) -> dict[str, Any] | None:
+    """Return the fields of a named tuple, or of a dataclass that Python writes by its fields; None of any other.
+
+    Fields that are not to be in the repr are left out, and those that a property computes.
+    """
+    kind = type(value)
+    if issubclass(kind, tuple):
+        names = declared(kind, "_fields")
+        return dict(zip(names, items_in(value), strict=False)) if type(names) is tuple else None
+    if declared(kind, "__repr__") is SimpleNamespace.__repr__:
+        return dict(_ATTRIBUTES.__get__(value))
+    if not _is_written_by_fields(kind):
+        return None
+    fields = ((field.name, stored(value, field.name)) for field in dataclasses.fields(kind) if field.repr)
+    return {name: found[0] for name, found in fields if found}
+
+
+def _is_written_by_fields(kind: type) -> bool:
+    """Whether a class has the repr that ``dataclass`` makes: one of its author's own may be to hide something."""
+    if type(declared(kind, "__dataclass_fields__")) is not dict:
+        return False
+    # The function that dataclass makes is recognized as pprint does it.
+    made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
+    return type(made) is FunctionType and "__create_fn__" in made.__qualname__
+
+
+_is_in_preview: Final = ContextVar("_is_in_preview", default=False)
+
+
+def silent_numpy() -> AbstractContextManager[Any]:
+    """Return what keeps numpy from warning of numbers that overflow or are none: they are counted, and shown."""
+    numpy = sys.modules.get("numpy")
+    return nullcontext() if numpy is None else numpy.errstate(all="ignore")
+
+
+@contextmanager
+def preview_context() -> Iterator[bool]:
+    """Look at a value: numpy keeps silent about numbers that overflow.
+
+    Yields
+    ------
+    bool
+        Whether another value is being looked at meanwhile, since a function or repr of a user's shows a picture. One
+        that shows the run that its own value is in would never come to an end.
+    """
+    is_nested = _is_in_preview.get()
+    token = _is_in_preview.set(True)
+    try:
+        with silent_numpy():
+            yield is_nested
+    finally:
+        _is_in_preview.reset(token)

@@ -1,20 +1,19 @@
-"""How are points and lines drawn over the image that they were found in?
+"""Charts of numbers, and marks drawn over the image that they were found in.
 
-Without an image at hand they become a chart in their own extent.
+Without an image at hand marks become a chart in their own extent.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.charts import place_chart, spread
-from epypes.display.previews.imagekinds import image_kind, sampled
-from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_image, encode_small, pillow_image
-from epypes.display.previews.shown import Backdrop, Chart, Marks, Most, Scene
+from epypes.display.previews.encoding import encode_image, encode_small, pillow, pillow_image
+from epypes.display.previews.images import image_kind, sampled, some_of
+from epypes.display.previews.model import THUMBNAIL_PX, Backdrop, Chart, Marks, Most, Picture, Scene
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -22,7 +21,114 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from PIL import Image
 
-    Floats = npt.NDArray[np.float64]
+    from epypes.display.previews.model import Floats
+
+# -- charts -----------------------------------------------------------------------------------------------------------
+
+MOST_POINTS: Final = 128
+MOST_LINES: Final = MOST_POINTS // 4
+_BINS: Final = MOST_POINTS // 2
+# Of the frame that a chart is painted into.
+_ASPECT: Final = 4 / 3
+
+
+def line_chart(values: Any) -> Chart:
+    """Draw a signal; of a long one the least and the largest value of each part, so that no peak is lost."""
+    import numpy as np
+
+    signal = _finite_or_nan(values)
+    if signal.size > MOST_POINTS:
+        parts = np.array_split(signal, _BINS)
+        signal = np.array([end for part in parts for end in _ends(part)])
+    x = np.linspace(0.0, 1.0, max(signal.size, 2))[: signal.size]
+    kept = np.isfinite(signal)
+    return Chart("line", (_pairs(x[kept], _scaled(signal[kept])),))
+
+
+def bar_chart(counts: Any) -> Chart:
+    """Draw a histogram; of many bins several are added up to one bar."""
+    import numpy as np
+
+    bars = np.nan_to_num(_finite_or_nan(counts), nan=0.0)
+    if bars.size > _BINS:
+        bars = np.array([part.sum() for part in np.array_split(bars, _BINS)])
+    largest = float(np.abs(bars).max(initial=0.0)) or 1.0
+    x = (np.arange(bars.size) + 0.5) / max(bars.size, 1)
+    return Chart("bars", (_pairs(x, np.clip(bars / largest, 0.0, 1.0)),))
+
+
+def place_chart(points: Floats, lines: tuple[Floats, ...]) -> Chart:
+    """Draw places of an image without the image: in their own extent, both axes alike, y downwards."""
+    import numpy as np
+
+    series = _shortened(lines) if lines else (points[spread(len(points), MOST_POINTS)],)
+    every = np.concatenate([*series, np.empty((0, 2))])
+    if not len(every):
+        return Chart("points", ())
+    low, high = every.min(axis=0), every.max(axis=0)
+    size = max(float(high[0] - low[0]) / _ASPECT, float(high[1] - low[1])) or 1.0
+    middle = (low + high) / 2
+    placed = []
+    for places in series:
+        x = 0.5 + (places[:, 0] - middle[0]) / (size * _ASPECT)
+        y = 0.5 - (places[:, 1] - middle[1]) / size
+        placed.append(_pairs(x, y))
+    return Chart("line" if lines else "points", tuple(placed))
+
+
+def spread(count: int, most: int) -> npt.NDArray[np.intp]:
+    """Return the indices of some of so many, from the first to the last."""
+    import numpy as np
+
+    return np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.intp)
+
+
+def drawn_in_chart(points: int, lines: int) -> int:
+    """Return how many of so many lines, or without lines of so many points, a chart has."""
+    return min(lines, MOST_LINES) or min(points, MOST_POINTS)
+
+
+def _shortened(lines: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    """Return the longest of many lines, each with every n-th of its points."""
+    longest = sorted(lines, key=len, reverse=True)[:MOST_LINES]
+    most = MOST_POINTS // len(longest)
+    return tuple(line[:: -(-len(line) // most)] for line in longest)
+
+
+def _finite_or_nan(values: Any) -> Floats:
+    """Return values as floats; of very many every n-th."""
+    import numpy as np
+
+    flat = some_of(values).reshape(-1).astype(np.float64)
+    return np.where(np.isfinite(flat), flat, np.nan)
+
+
+def _ends(part: Floats) -> tuple[float, float]:
+    import numpy as np
+
+    finite = part[np.isfinite(part)]
+    if not finite.size:
+        return np.nan, np.nan
+    low, high = int(finite.argmin()), int(finite.argmax())
+    first, last = sorted((low, high))
+    return float(finite[first]), float(finite[last])
+
+
+def _scaled(values: Floats) -> Floats:
+    """Return values between 0 and 1; of a constant, the middle."""
+    import numpy as np
+
+    if not values.size:
+        return values
+    low, high = values.min() / 2, values.max() / 2
+    return (values / 2 - low) / (high - low) if high > low else np.full_like(values, 0.5)
+
+
+def _pairs(x: Floats, y: Floats) -> tuple[tuple[float, float], ...]:
+    return tuple((round(float(a), 4), round(float(b), 4)) for a, b in zip(x, y, strict=True))
+
+
+# -- marks ------------------------------------------------------------------------------------------------------------
 
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
 _OVERSAMPLED: Final = 2
@@ -73,22 +179,17 @@ def some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = Non
     return Marks(np.empty((0, 2)), tuple(_drawable_lines(kept)), are_closed, count)
 
 
-def _drawable_lines(lines: list[Any]) -> Iterator[Floats]:
-    """Yield the lines without what can't be drawn of them; looked at together, since there may be thousands."""
+def _drawable_lines(lines: list[Any]) -> list[Floats]:
+    """Return the lines without what can't be drawn of them; looked at together, since there may be thousands."""
     import numpy as np
 
     if not lines:
-        return
-    places = np.concatenate(lines).astype(np.float64)
-    is_drawn = _is_drawable(places)
-    end = 0
-    for line in lines:
-        start, end = end, end + len(line)
-        found = places[start:end]
-        if not is_drawn[start:end].all():
-            found = found[is_drawn[start:end]]
-        if len(found):
-            yield found
+        return []
+    places, ends = np.concatenate(lines).astype(np.float64), np.cumsum(list(map(len, lines)))[:-1]
+    is_drawn, found = _is_drawable(places), np.split(places, ends)
+    if is_drawn.all():
+        return found
+    return [kept for line, is_kept in zip(found, np.split(is_drawn, ends), strict=True) if len(kept := line[is_kept])]
 
 
 def _share(lengths: Iterable[int], room: int) -> int:
@@ -189,12 +290,9 @@ def _drawn_over(backdrop: Backdrop, marks: Marks, side: int = THUMBNAIL_PX) -> I
 def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image.Image:
     import numpy as np
 
-    with optional_import():
-        from PIL import Image
-
     side = THUMBNAIL_PX * _OVERSAMPLED // 2
     (left, left_scale), (right, right_scale) = (_canvas(backdrop, side) for backdrop in backdrops)
-    canvas = Image.new("RGB", (2 * side, max(left.height, right.height)))
+    canvas: Image.Image = pillow().new("RGB", (2 * side, max(left.height, right.height)))
     canvas.paste(left, (side - left.width, 0))
     canvas.paste(right, (side, 0))
     pen = _Pen(canvas)
@@ -210,14 +308,11 @@ def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image
 
 def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     """Return an image to be drawn upon, a little darker, and how many of its pixels are one of the image."""
-    with optional_import():
-        from PIL import Image
-
     array, picture = backdrop.image, _picture(backdrop, side)
     scale = side / max(array.shape[:2])
     # Even sides, so that each pixel of the thumbnail is made of four.
     height, width = (max(1, round(length * scale / _OVERSAMPLED)) * _OVERSAMPLED for length in array.shape[:2])
-    picture = picture.resize((width, height), Image.Resampling.BILINEAR)
+    picture = picture.resize((width, height), pillow().Resampling.BILINEAR)
     return picture.point(lambda level: round(level * _DARKER)), scale
 
 
@@ -254,31 +349,25 @@ class _Pen:
             return
         for start, end in itertools.pairwise(places):
             near = self._near_part(start, end)
-            if near is not None:
+            if near:
                 self._draw.line(near, fill=colour, width=width)
 
     def _is_near(self, places: Iterable[_Place]) -> bool:
         (left, top), (right, bottom) = self._low, self._high
         return all(left <= x <= right and top <= y <= bottom for x, y in places)
 
-    def _near_part(self, start: _Place, end: _Place) -> tuple[_Place, _Place] | None:
-        """Return the part of a line that is near; None if there is none, or if an end is nowhere."""
+    def _near_part(self, start: _Place, end: _Place) -> list[_Place]:
+        """Return the ends of the part of a line that is near (Liang and Barsky); none if there is none."""
+        axes = list(zip(start, end, self._low, self._high, strict=True))
         first, last = 0.0, 1.0
-        for a, b, low, high in zip(start, end, self._low, self._high, strict=True):
-            if not math.isfinite(b - a):
-                return None
-            if a == b:
-                if not low <= a <= high:
-                    return None
-                continue
-            enters, leaves = sorted(((low - a) / (b - a), (high - a) / (b - a)))
-            first, last = max(first, enters), min(last, leaves)
+        for a, b, low, high in axes:
+            if not math.isfinite(b - a) or (a == b and not low <= a <= high):
+                return []
+            if a != b:
+                enters, leaves = sorted(((low - a) / (b - a), (high - a) / (b - a)))
+                first, last = max(first, enters), min(last, leaves)
         if first > last:
-            return None
-        return self._between(start, end, first), self._between(start, end, last)
-
-    def _between(self, start: _Place, end: _Place, share: float) -> _Place:
+            return []
         # Within limits once more: of very large numbers the difference is not exact.
-        ends = zip(start, end, self._low, self._high, strict=True)
-        x, y = (min(max(a + share * (b - a), low), high) for a, b, low, high in ends)
-        return x, y
+        parts = [[min(max(a + share * (b - a), low), high) for a, b, low, high in axes] for share in (first, last)]
+        return [(x, y) for x, y in parts]

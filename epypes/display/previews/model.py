@@ -1,25 +1,47 @@
-"""What does a preview consist of, and what may it look at beside the value?"""
+"""What a preview consists of, and what it may look at beside the value."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.display.previews.ranges import Range, display_range
-from epypes.display.previews.raster import Picture
+from epypes.display.previews.images import Range, display_range
 from epypes.images import Order
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    Array = npt.NDArray[Any]
     Floats = npt.NDArray[np.float64]
 
+THUMBNAIL_PX: Final = 128
+THUMBNAIL_BYTES: Final = 5_000
 # On a thumbnail.
 MOST_MARKS: Final = 200
 # More lines than that, from one image to another, cover both.
 MOST_PAIRS: Final = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An encoded picture.
+
+    Attributes
+    ----------
+    data
+        The bytes of the file.
+    media_type
+        ``"image/jpeg"`` or ``"image/png"``.
+    width, height
+        Its size, in pixels.
+    """
+
+    data: bytes = field(repr=False)
+    media_type: str
+    width: int
+    height: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +101,7 @@ class Sketch:
     scene
         Returns the image that the thumbnail is made of, and what is drawn over it; None for charts and texts.
     note
-        Which values are black and white, where the dtype of an image does not tell.
+        Which values are black and white, where the dtype of an image does not show.
     """
 
     shown: Preview
@@ -164,32 +186,19 @@ class Most:
     pairs: int = MOST_PAIRS
 
 
-class Surroundings(Protocol):
-    """The images of a value's graph that it may be drawn over; asked only by what can be drawn."""
+class Surroundings:
+    """The images of a value's graph that it may be drawn over; a value that stands alone has none."""
 
     def nearest_image(self) -> Backdrop | None:
         """Return the nearest image that the value was made from."""
+        return None
 
     def image_pair(self) -> tuple[Backdrop, Backdrop] | None:
         """Return the two images that the value was made from, in the order of its function's inputs."""
+        return None
 
     def keypoint_pair(self) -> tuple[Any, Any] | None:
         """Return the keypoints of these two images."""
-
-
-class Nowhere:
-    """The surroundings of a value that stands alone."""
-
-    def nearest_image(self) -> Backdrop | None:
-        """Return None."""
-        return None
-
-    def image_pair(self) -> tuple[Backdrop, Backdrop] | None:
-        """Return None."""
-        return None
-
-    def keypoint_pair(self) -> tuple[Any, Any] | None:
-        """Return None."""
         return None
 
 
@@ -211,5 +220,5 @@ class Look:
 
     order: Order = "bgr"
     range_of: Callable[[Any], Range] = display_range
-    around: Surroundings = field(default_factory=Nowhere)
+    around: Surroundings = field(default_factory=Surroundings)
     most: Most = field(default_factory=Most)
