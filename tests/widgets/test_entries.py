@@ -71,19 +71,19 @@ def test_what_the_screen_is_told_last_is_the_newest_history(
     panel: Panel, screen: FrontEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     panel.wait(60)
-    told, code = [], panel._screen._code
+    told, code = [], panel._screen.code
 
     def slow_code() -> str:
         """While one thread has looked at the history and not told it yet, have another add an entry and tell it."""
         if not told:
-            other = threading.Thread(target=panel._screen.tell_history)
+            other = threading.Thread(target=panel._screen.send_history)
             told.append(other)
             panel._history.commit({"gain": 2, "threshold": 61})
             other.start()
             other.join(0.2)
         return code()
 
-    monkeypatch.setattr(panel._screen, "_code", slow_code)
-    panel._screen.tell_history()
+    monkeypatch.setattr(panel._screen, "code", slow_code)
+    panel._screen.send_history()
     told[0].join(60)
     assert [entry["values"]["threshold"] for entry in screen.last("history")["entries"]] == [100, 61]

@@ -211,18 +211,18 @@ def test_what_others_set_under_the_hand_is_told_and_not_overwritten(
 ) -> None:
     is_following(panel, service)
     screen.tell("hold", names=["threshold"])
-    panel._hand.control("threshold").widget.value = 61
+    panel._controls.control("threshold").widget.value = 61
     panel.wait(TIMEOUT_S)
     service.set_parameters({"threshold": 33}, None)
-    until(lambda: any("Somebody else has set threshold to 33" in line for line in panel.log))
-    panel._hand.control("threshold").widget.value = 62
+    until(lambda: any("Another client has set threshold to 33" in line for line in panel.log))
+    panel._controls.control("threshold").widget.value = 62
     panel.wait(TIMEOUT_S)
     assert service.entries["threshold"]["value"] == 33
-    assert "Somebody else has set threshold to 33" in screen.last("note")["text"]
+    assert "Another client has set threshold to 33" in screen.last("note")["text"]
     screen.tell("release")
     panel.wait(TIMEOUT_S)
     assert (panel["threshold"], service.entries["threshold"]["value"]) == (33, 33)
-    panel._hand.control("threshold").widget.value = 63
+    panel._controls.control("threshold").widget.value = 63
     panel.wait(TIMEOUT_S)
     assert (service.entries["threshold"]["value"], screen.last("note")["text"]) == (63, "")
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from epypes.errors import ServiceError
-from epypes_widgets.writeback import WritingBack, Written
+from epypes_widgets.promotion import Outcome, WriteBack
 
 TIMEOUT_S = 60.0
 DIFF = "--- pipeline.toml\n+++ pipeline.toml\n-value = 70\n+value = 60\n"
@@ -32,30 +32,31 @@ class Service:
 
 
 @pytest.fixture
-def told() -> list[Written]:
+def told() -> list[Outcome]:
     return []
 
 
-@pytest.fixture
-def back(told: list[Written]) -> WritingBack:
-    return WritingBack(told.append)
+def write_back_of(service: Service, told: list[Outcome]) -> WriteBack:
+    return WriteBack(service.write_back, told.append)
 
 
-def test_a_dry_run_shows_the_differences_and_writing_tells_the_digest(back: WritingBack, told: list[Written]) -> None:
+def test_a_dry_run_shows_the_differences_and_writing_tells_the_digest(told: list[Outcome]) -> None:
     service = Service()
-    assert back.start(service, dry_run=True)
-    assert back.wait(TIMEOUT_S) == Written("diff", "This would change in pipeline.toml.", DIFF)
-    assert back.start(service, dry_run=False)
+    back = write_back_of(service, told)
+    assert back.start(dry_run=True)
+    assert back.wait(TIMEOUT_S) == Outcome("diff", "This would change in pipeline.toml.", diff=DIFF)
+    assert back.start(dry_run=False)
     done = back.wait(TIMEOUT_S)
-    assert done == Written("done", "Written to pipeline.toml and replayed; the bundle is 3f3f3f3f3f3f now.", DIFF)
+    assert done == Outcome("done", "Written to pipeline.toml and replayed; the bundle is 3f3f3f3f3f3f now.", diff=DIFF)
     assert [each.state for each in told] == ["running", "diff", "running", "done"]
     assert service.asked == [True, False]
 
 
-def test_without_differences_nothing_is_asked(back: WritingBack) -> None:
-    back.start(Service(diff=""), dry_run=True)
+def test_without_differences_nothing_is_asked(told: list[Outcome]) -> None:
+    back = write_back_of(Service(diff=""), told)
+    back.start(dry_run=True)
     done = back.wait(TIMEOUT_S)
-    assert done == Written("done", "pipeline.toml has these values already; the bundle is 3f3f3f3f3f3f.")
+    assert done == Outcome("done", "pipeline.toml has these values already; the bundle is 3f3f3f3f3f3f.")
 
 
 @pytest.mark.parametrize(
@@ -65,16 +66,18 @@ def test_without_differences_nothing_is_asked(back: WritingBack) -> None:
         (ValueError("oh"), "Not written: ValueError: oh"),
     ],
 )
-def test_a_refusal_is_told(back: WritingBack, error: Exception, text: str) -> None:
-    back.start(Service(error=error), dry_run=False)
-    assert back.wait(TIMEOUT_S) == Written("refused", text)
+def test_a_refusal_is_told(told: list[Outcome], error: Exception, text: str) -> None:
+    back = write_back_of(Service(error=error), told)
+    back.start(dry_run=False)
+    assert back.wait(TIMEOUT_S) == Outcome("refused", text)
 
 
-def test_one_is_written_at_a_time(back: WritingBack) -> None:
+def test_one_is_written_at_a_time(told: list[Outcome]) -> None:
     service = Service()
+    back = write_back_of(service, told)
     service.may_end.clear()
-    assert back.start(service, dry_run=True)
-    assert not back.start(service, dry_run=False)
+    assert back.start(dry_run=True)
+    assert not back.start(dry_run=False)
     service.may_end.set()
     back.wait(TIMEOUT_S)
     assert service.asked == [True]

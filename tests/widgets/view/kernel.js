@@ -266,8 +266,8 @@ const answers = {
   probe({ id, x, y }) {
     kernel.deliver({ kind: "probe", id, x, y, rows: STAGES.slice(0, 4).map((token) => ({ token, text: token === "image" ? "B 12 G 40 R 200" : String((x + y) % 256), state: "fresh" })) });
   },
-  save({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark", name], said: `saved ${name}.toml`, ok: true }); },
-  load({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark"], said: `There are no settings ${name}.`, ok: false }); },
+  save({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark", name], text: `saved ${name}.toml`, ok: true }); },
+  load({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark"], text: `There are no settings ${name}.`, ok: false }); },
   promote({ to }) {
     kernel.deliver({ kind: "promoted", state: "running", text: "", to });
     setTimeout(() => kernel.deliver({ kind: "promoted", state: "done", text: `3 functions written to ${to}; replayed, same values`, to }), 30);

@@ -102,7 +102,7 @@ export function footPart(panel) {
     history: (message) => message.code !== undefined && tellCode(message.code),
     settings(message) {
       offer(message.names ?? []);
-      tell(said, message.said ?? "", message.ok);
+      tell(said, message.text ?? "", message.ok);
     },
     promoted(message) {
       const isRunning = message.state === "running";

@@ -1,6 +1,6 @@
-"""At which values do the controls stand, and which of them does the hand hold?
+"""The controls of a panel: their values, and which of them the user holds.
 
-What moves by itself under the hand is never moved by us: a value for a control that is held waits until it is let go.
+A control that is held is never moved by the kernel: a value for it waits until it is released.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from epypes.errors import UnknownName
-from epypes.hints import Param, Roi, Text
+from epypes.hints import Param
 from epypes_widgets.controls import Control
-from epypes_widgets.controls.quiet import slide
+from epypes_widgets.ranges import Range
 from epypes_widgets.values import differing
 
 
-class Hand:
+class ControlSet:
     """The controls of a panel; may be used from any thread.
 
     Parameters
@@ -27,7 +27,7 @@ class Hand:
 
     def __init__(self, controls: Iterable[Control]) -> None:
         self.controls = tuple(controls)
-        self._sliders = {control.widget.model_id: control.widget for control in self.controls}
+        self._widgets = {control.widget.model_id: control.widget for control in self.controls}
         self._by_name = {name: control for control in self.controls for name in control.names}
         self._lock = threading.RLock()
         self._held: set[str] = set()
@@ -42,15 +42,21 @@ class Hand:
     @property
     def movable(self) -> dict[str, Any]:
         """The values of the controls that are not only shown, by token."""
-        movable = (control for control in self.controls if control.kind != "shown")
-        return {name: value for control in movable for name, value in control.read().items()}
+        return {name: value for name, value in self.values.items() if self._by_name[name].kind != "shown"}
 
     @property
-    def params(self) -> dict[str, Param | Roi | Text | None]:
+    def params(self) -> dict[str, Range]:
         """What each hyperparameter may be, by token."""
-        return {
-            name: param for control in self.controls for name, param in zip(control.names, control.params, strict=True)
-        }
+        return {n: param for control in self.controls for n, param in zip(control.names, control.params, strict=True)}
+
+    @property
+    def thresholds(self) -> dict[str, list[str]]:
+        """The hyperparameters that are thresholds, by the token that they cut."""
+        cuts: dict[str, list[str]] = {}
+        for name, param in self.params.items():
+            if isinstance(param, Param) and param.cuts:
+                cuts.setdefault(param.cuts, []).append(name)
+        return cuts
 
     @property
     def is_holding(self) -> bool:
@@ -63,11 +69,10 @@ class Hand:
             raise UnknownName("hyperparameter", name, self._by_name, "of this panel")
         return self._by_name[name]
 
-    def set(self, values: Mapping[str, Any], *, is_by_hand: bool = False) -> dict[str, Any]:
+    def set(self, values: Mapping[str, Any], *, by_user: bool = False) -> dict[str, Any]:
         """Move controls to values that were set, all or none, and return them as the hyperparameters take them.
 
-        Those of controls that are held are not among them, unless it is the hand that sets them: they wait until the
-        control is let go.
+        A value for a control that is held waits, unless the user sets it, and is not returned.
 
         Raises
         ------
@@ -78,31 +83,30 @@ class Hand:
         """
         parts = self._parts(values)
         with self._lock:
-            held = [part for part in parts if not is_by_hand and self._held.intersection(part[0].names)]
-            for control, own in held:
-                control.mechanism.checked(own)
-            parts = [part for part in parts if part not in held]
-            before = {control: control.read() for control, _ in parts}
+            held = {} if by_user else {control: own for control, own in parts.items() if self._is_held(control)}
+            for control, own in held.items():
+                control.check(own)
+            before = {control: control.read() for control in parts if control not in held}
             try:
-                for control, own in parts:
-                    control.write(own)
+                for control in before:
+                    control.write(parts[control])
             except ValueError:
                 for control, own in before.items():
                     if differing(own, control.read()):
                         control.write(own)
                 raise
-            for _, own in held:
+            for own in held.values():
                 self._waiting.update(own)
-            return {name: control.read()[name] for control, own in parts for name in own}
+            return {name: control.read()[name] for control in before for name in parts[control]}
 
     def slide(self, places: Mapping[str, Any]) -> None:
-        """Take where sliders are that are being dragged, by the id of their model; they tell as if let go there."""
+        """Move sliders that are being dragged, by the id of their model, as if the front end had set their value."""
         for model, place in places.items():
-            if model in self._sliders:
-                slide(self._sliders[model], place)
+            if model in self._widgets:
+                self._widgets[model].set_state({"value": place})
 
     def follow(self, values: Mapping[str, Any]) -> list[str]:
-        """Move controls to what the runner has got from elsewhere; those that are held follow when they are let go.
+        """Move controls to values of the runner; those that are held follow when they are released.
 
         Returns
         -------
@@ -111,8 +115,8 @@ class Hand:
         """
         refused = []
         with self._lock:
-            for control, own in self._parts({name: value for name, value in values.items() if name in self._by_name}):
-                if self._held.intersection(control.names):
+            for control, own in self._parts({n: value for n, value in values.items() if n in self._by_name}).items():
+                if self._is_held(control):
                     self._waiting.update(own)
                     continue
                 try:
@@ -121,43 +125,36 @@ class Hand:
                     refused.append(f"The control stays where it was: {error}")
         return refused
 
-    def moved(self, names: Iterable[str]) -> None:
-        """Know that the hand has moved these controls: what waited for them is out of date, unless it is contested."""
+    def moved(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Take note of what the user has moved, and return what may be set of it.
+
+        What waited for these controls is out of date. A contested value is not set: it waits for the release.
+        """
         with self._lock:
-            for name in names:
-                if name not in self._contested:
-                    self._waiting.pop(name, None)
+            allowed = {name: value for name, value in values.items() if name not in self._contested}
+            for name in allowed:
+                self._waiting.pop(name, None)
+            return allowed
 
     def contest(self, names: Iterable[str]) -> list[str]:
-        """Know that somebody else has set these: where one is held, the hand sets nothing until it has let go.
-
-        Returns
-        -------
-        list of str
-            Those that are held.
-        """
+        """Take note of what others have set, and return which of it is held: it can be set after a release only."""
         with self._lock:
             held = [name for name in names if name in self._held]
             self._contested.update(held)
             return held
 
-    def uncontested(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values that the hand may set."""
-        with self._lock:
-            return {name: value for name, value in values.items() if name not in self._contested}
-
     def hold(self, names: Iterable[str]) -> None:
-        """Know that these controls are held."""
+        """Take note that the user holds these controls."""
         with self._lock:
             self._held.update(name for name in names if name in self._by_name)
 
     def release(self) -> tuple[dict[str, Any], list[str]]:
-        """Know that nothing is held any more, and move the controls that had to wait.
+        """Take note that nothing is held, and move the controls that had to wait.
 
         Returns
         -------
         dict
-            The values that they had to wait for, by token.
+            The values that waited, by token.
         list of str
             Sentences as from ``follow``.
         """
@@ -167,9 +164,11 @@ class Hand:
             waiting, self._waiting = self._waiting, {}
             return waiting, self.follow(waiting)
 
-    def _parts(self, values: Mapping[str, Any]) -> list[tuple[Control, dict[str, Any]]]:
-        """Return the values by control."""
+    def _is_held(self, control: Control) -> bool:
+        return not self._held.isdisjoint(control.names)
+
+    def _parts(self, values: Mapping[str, Any]) -> dict[Control, dict[str, Any]]:
         parts: dict[Control, dict[str, Any]] = {}
         for name, value in values.items():
             parts.setdefault(self.control(name), {})[name] = value
-        return list(parts.items())
+        return parts

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.looking import Stage, best_stage, stages, states
+from epypes_widgets.stages import Stage, best_stage, stages, states
 
 
 def blurred(image: Any, sigma: float) -> Any:
@@ -98,13 +98,6 @@ def test_descriptors_come_after_the_keypoints_beside_them() -> None:
     assert best_stage(run, stages(run)) == "keypoints"
 
 
-def test_a_hyperparameter_that_is_changed_makes_pictures_stale_for_the_runner_alone(runner: Any) -> None:
-    found = stages(runner.last)
-    runner["quality"] = 0.2
-    assert states(runner, found) == {"image": "fresh", "blurred": "fresh", "corners": "stale", "count": "stale"}
-    assert set(states(runner.last, found).values()) == {"fresh"}
-
-
 def test_what_a_run_left_out_is_stale_or_absent(runner: Any) -> None:
     found = stages(runner.last)
     runner.rerun("blurred", sigma=2.0)
@@ -117,10 +110,5 @@ def test_what_a_function_failed_to_make_is_failed(runner: Any) -> None:
     found = stages(runner.last)
     with pytest.raises(ValueError, match="at most 1"):
         runner.rerun(quality=2.0)
-    said = states(runner, found)
+    said = states(runner.last, found)
     assert said == {"image": "fresh", "blurred": "fresh", "corners": "failed", "count": "absent"}
-
-
-def test_before_the_first_run_everything_is_absent(runner: Any) -> None:
-    found = stages(runner.last)
-    assert set(states(ep.CompGraphRunner(runner.cg), found).values()) == {"absent"}

@@ -1,4 +1,4 @@
-"""What is said about a hyperparameter, in a tooltip?"""
+"""The tooltip of a hyperparameter."""
 
 from __future__ import annotations
 
@@ -9,31 +9,28 @@ from typing import Any, Final
 
 from epypes.graph import CompGraph
 from epypes.graph.redefined import unwrapped
-from epypes.hints import Param, Roi, Text
-from epypes_widgets.guesses import Taker, takers
-from epypes_widgets.ranges import described
+from epypes.hints import Param
+from epypes_widgets.ranges import Range, Taker, range_text, takers
 
-LONGEST: Final = 300
+_MAX_CHARACTERS: Final = 300
 # Of a docstring: that of a class may be as long as a book.
-_READ: Final = 20_000
+_MAX_READ: Final = 20_000
 _PARAMETERS: Final = re.compile(r"^Parameters\n-{3,}\n(.*?)(?=^\S[^\n]*\n-{3,}$|\Z)", re.MULTILINE | re.DOTALL)
 _SIGNATURE: Final = re.compile(r"^[\w.]+\(.*\)(\s*->.*)?$")
 
 
-def tip(cg: CompGraph, token: str, param: Param | Roi | Text | None) -> str:
+def tooltip(cg: CompGraph, token: str, param: Range) -> str:
     """Return what is known of a hyperparameter in one line of plain text, at most 300 characters.
 
     It is what the docstring of a function that takes it says of its parameter, else what the hint says, else the first
     line of the docstring; then the unit and the range.
     """
-    said = next(_said(cg, token, param), "")
-    facts = _facts(param)
-    room = LONGEST - len(facts) - 1
-    text = _cut(said, room) if facts else _cut(said, LONGEST)
-    return _cut(" ".join(part for part in (text, facts) if part), LONGEST)
+    about, facts = next(_abouts(cg, token, param), ""), _facts(param)
+    text = _cut(about, _MAX_CHARACTERS - len(facts) - 1) if facts else about
+    return _cut(" ".join(part for part in (text, facts) if part), _MAX_CHARACTERS)
 
 
-def _said(cg: CompGraph, token: str, param: Param | Roi | Text | None) -> Iterator[str]:
+def _abouts(cg: CompGraph, token: str, param: Range) -> Iterator[str]:
     documented = [(taker, _docstring(taker.function)) for taker in takers(cg, token)]
     yield from filter(None, (_parameter_text(text, taker) for taker, text in documented))
     about = _one_line(getattr(param, "about", ""))
@@ -44,7 +41,7 @@ def _said(cg: CompGraph, token: str, param: Param | Roi | Text | None) -> Iterat
 
 def _docstring(function: Any) -> str:
     try:
-        return (inspect.getdoc(unwrapped(function)) or "")[:_READ]
+        return (inspect.getdoc(unwrapped(function)) or "")[:_MAX_READ]
     except Exception:  # a docstring may be any object
         return ""
 
@@ -84,14 +81,14 @@ def _first_line(docstring: str) -> str:
     return "" if _SIGNATURE.match(first) else _one_line(first)
 
 
-def _facts(param: Param | Roi | Text | None) -> str:
+def _facts(param: Range) -> str:
     if param is None:
         return ""
     if not isinstance(param, Param):
-        return _sentence(described(param))
+        return _sentence(range_text(param))
     unit = f" {param.unit}" if param.unit else ""
     free = param.low is None and param.high is None and not param.odd and param.choices is None
-    hard = "" if free else described(param)
+    hard = "" if free else range_text(param)
     if param.soft is None or param.soft == (param.low, param.high):
         return _sentence(hard + unit if hard else "")
     usual = f"usually {param.soft[0]:g} to {param.soft[1]:g}{unit}"

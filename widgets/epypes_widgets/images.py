@@ -1,4 +1,4 @@
-"""Which payloads can a panel be switched to?"""
+"""The test images of a panel: payloads that it can be switched to."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from epypes.display.previews.looking import silent_numpy
 from epypes.display.previews.raster import encode_small, pillow_image
 from epypes.errors import PayloadError, UnknownName
 from epypes.graph import colour_order
-from epypes_widgets.places import Tunable
+from epypes_widgets.target import Tunable
 
 _THUMBNAIL_PX: Final = 96
 _TITLE_CHARACTERS: Final = 40
@@ -97,7 +97,7 @@ def _values(runner: Tunable, free: tuple[str, ...], item: Any, where: str) -> di
         raise PayloadError((), "The graph has no free source token to give images to. Leave images out.")
     if not isinstance(item, Mapping):
         if len(free) > 1:
-            text = f"{where} does not tell which of {_named(free)} it is. Give mappings: {_call(free)}."
+            text = f"{where} does not say which of {_named(free)} it is. Give mappings: {_call(free)}."
             raise PayloadError(free, text)
         return {free[0]: item}
     for token in item:

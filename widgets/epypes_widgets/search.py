@@ -13,23 +13,22 @@ from epypes.errors import EpypesError, ScaleError, StillRunning
 from epypes.hints import Param
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
-from epypes_widgets.places import Tunable
-from epypes_widgets.values import said
+from epypes_widgets.promotion import Job
+from epypes_widgets.target import Tunable
+from epypes_widgets.values import setting_text
 
 if TYPE_CHECKING:
     from epypes.batch.optimize import Direction, OptimizeResult, Trial
 
 _LOG: Final = logging.getLogger(__name__)
 # The eye follows no more, and each time the whole curve goes to the page.
-_TELL_S: Final = 0.2
+_REPORT_S: Final = 0.2
 FIRST_N: Final = 50
-MOST_TRIALS: Final = 10_000
-
-State = Literal["idle", "running", "stopping", "done", "refused"]
+MAX_TRIALS: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Progress:
     """How far a search has come.
 
     Attributes
@@ -42,7 +41,7 @@ class Found:
     n
         How many trials there are to be.
     values
-        What the metric gave, trial by trial; None for one that failed.
+        The metric, trial by trial; None for one that failed.
     best
         The place of the best one among them; None if none completed.
     setting
@@ -51,7 +50,7 @@ class Found:
         How much each matters, as parts of 1; empty before the end.
     """
 
-    state: State = "idle"
+    state: Literal["idle", "running", "stopping", "done", "refused"] = "idle"
     text: str = ""
     n: int = FIRST_N
     values: tuple[float | None, ...] = ()
@@ -60,7 +59,7 @@ class Found:
     importances: Mapping[str, float] | None = None
 
 
-class Searching:
+class Search(Job):
     """Searches hyperparameters on a thread of its own, one search at a time.
 
     Parameters
@@ -76,10 +75,12 @@ class Searching:
     ----------
     result
         What ``ep.optimize`` returned last; None before.
-    told
+    progress
+        What was reported last.
+    reports
         How often something was reported.
     report
-        Is called with each ``Found``, on any thread. What it raises is logged.
+        Is called when there is progress, on any thread. What it raises is logged.
     """
 
     def __init__(
@@ -90,71 +91,56 @@ class Searching:
         cases: Any,
         ranges: Callable[[], Mapping[str, Any]],
     ) -> None:
+        super().__init__("epypes-search")
         self.metric: str = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         self.direction = direction
         self.result: OptimizeResult | None = None
-        self.report: Callable[[Found], None] = _tell_nobody
+        self.progress, self.reports = Progress(), 0
+        self.report: Callable[[], None] = lambda: None
         self._runner, self._measure, self._cases, self._ranges = runner, metric, cases, ranges
-        self._lock = threading.Lock()
+        # Held while reporting, so that nothing older comes after something newer.
+        self._reporting = threading.RLock()
         self._stop = threading.Event()
-        self._ended = threading.Event()
-        self._ended.set()
-        self._found = Found()
-        self.told = 0
         self._trials: list[Trial] = []
-        self._told_s = 0.0
-
-    @property
-    def found(self) -> Found:
-        """What was reported last."""
-        return self._found
-
-    @property
-    def is_running(self) -> bool:
-        """Whether a search has begun and not ended."""
-        return not self._ended.is_set()
+        self._reported_s = 0.0
 
     def start(self, n: int = FIRST_N) -> bool:
         """Begin a search of so many trials and return at once; False, and nothing else, if one is running."""
-        n = min(max(1, n), MOST_TRIALS)
-        with self._lock:
+        n = min(max(1, n), MAX_TRIALS)
+        with self._reporting:
             if self.is_running:
                 return False
-            self._ended.clear()
             self._stop.clear()
             self._trials = []
-            self._tell(Found("running", f"Trial 1 of {n} ...", n))
-        threading.Thread(target=self._work, args=(n,), name="epypes-search", daemon=True).start()
-        return True
+            self._tell(Progress("running", f"Trial 1 of {n} ...", n))
+            return self.run(lambda: self._search(n))
 
     def stop(self) -> None:
         """Have the search end when the case that runs has ended; return at once."""
-        with self._lock:
-            if not self.is_running or self._stop.is_set():
-                return
-            self._stop.set()
-            self._tell(_so_far(tuple(self._trials), self.direction, self._found.n, "stopping"))
+        with self._reporting:
+            if self.is_running and not self._stop.is_set():
+                self._stop.set()
+                self._tell(_so_far(self._trials, self.direction, self.progress.n, "stopping"))
 
     def wait(self, timeout_s: float) -> OptimizeResult | None:
         """Return the result once nothing is running; TimeoutError if that takes longer."""
-        if not self._ended.wait(timeout_s):
-            raise TimeoutError(f"The search did not end within {timeout_s:g} s.")
+        self.wait_end(timeout_s)
         return self.result
 
     def close(self, timeout_s: float) -> None:
         """Stop, and wait for that; StillRunning if a function does not return in time."""
         self.stop()
         if not self._ended.wait(timeout_s):
-            raise StillRunning("epypes-search", (), timeout_s)
+            raise StillRunning(self._name, (), timeout_s)
 
-    def _work(self, n: int) -> None:
+    def _search(self, n: int) -> None:
         from epypes.batch.optimize import optimize
 
         try:
-            self.result = result = optimize(
+            self.result = optimize(
                 self._runner,
                 self._measure,
-                self._of_last_run() if self._cases is None else self._cases,
+                self._last_payload() if self._cases is None else self._cases,
                 n,
                 direction=self.direction,
                 ranges={name: param for name, param in self._ranges().items() if isinstance(param, Param)},
@@ -162,17 +148,17 @@ class Searching:
                 on_trial=self._tried,
                 progress=False,
             )
-            found = _at_end(result, n)
+            progress = _at_end(self.result, n)
         except EpypesError as error:
-            found = Found("refused", str(error), n, tuple(trial.value for trial in self._trials))
+            progress = Progress("refused", str(error), n, tuple(trial.value for trial in self._trials))
         except BaseException as error:  # a generator of cases, for example, may raise anything
             _LOG.exception("A search has failed")
-            found = Found("refused", f"{type(error).__name__}: {error}", n)
-        with self._lock:
-            self._tell(found)
+            progress = Progress("refused", f"{type(error).__name__}: {error}", n)
+        with self._reporting:
+            self._tell(progress)
             self._ended.set()
 
-    def _of_last_run(self) -> list[Mapping[str, Any]]:
+    def _last_payload(self) -> list[Mapping[str, Any]]:
         last = self._runner.last
         if last is None:
             raise ScaleError("Nothing has been run yet, so there is no case. Give some: tune(runner, cases=[...]).")
@@ -181,101 +167,81 @@ class Searching:
     def _tried(self, trial: Trial) -> None:
         self._trials.append(trial)
         now_s = monotonic()
-        if now_s - self._told_s < _TELL_S:
+        if now_s - self._reported_s < _REPORT_S:
             return
-        self._told_s = now_s
-        with self._lock:
+        self._reported_s = now_s
+        with self._reporting:
             if not self._stop.is_set():
-                self._tell(_so_far(self._trials, self.direction, self._found.n, "running"))
+                self._tell(_so_far(self._trials, self.direction, self.progress.n, "running"))
 
-    def _tell(self, found: Found) -> None:
-        """Report how far it is; to be called under the lock, so that nothing older comes after something newer."""
-        self._found, self.told = found, self.told + 1
+    def _tell(self, progress: Progress) -> None:
+        self.progress, self.reports = progress, self.reports + 1
         try:
-            self.report(found)
+            self.report()
         except Exception:
             _LOG.exception("How far a search has come could not be shown")
 
 
-def told(search: Searching | None) -> dict[str, Any] | None:
-    """Return what a view is told of a search, ready for JSON; None if there is none."""
+def search_content(search: Search | None) -> dict[str, Any] | None:
+    """Return what a view gets of a search, ready for JSON; None if there is none."""
     if search is None:
         return None
-    found = search.found
+    progress = search.progress
     return {
-        "state": found.state,
-        "text": found.text,
-        "n": found.n,
-        "values": list(found.values),
-        "best": found.best,
-        "setting": "" if found.setting is None else _in_words(found.setting),
-        "importances": [[name, part] for name, part in (found.importances or {}).items()],
+        "state": progress.state,
+        "text": progress.text,
+        "n": progress.n,
+        "values": list(progress.values),
+        "best": progress.best,
+        "setting": setting_text(progress.setting or {}),
+        "importances": [[name, part] for name, part in (progress.importances or {}).items()],
         "metric": search.metric,
         "direction": search.direction,
-        "seq": search.told,
+        "seq": search.reports,
     }
 
 
 def search_of(
     runner: Tunable, metric: Any, direction: Direction, cases: Any, ranges: Callable[[], Mapping[str, Any]]
-) -> Searching | None:
-    """Return what searches the hyperparameters of a runner; None without a metric.
-
-    Raises
-    ------
-    TypeError
-        It is a running service that is tuned.
-    """
+) -> Search | None:
+    """Return the search of a runner's hyperparameters; None without a metric, TypeError for a running service."""
     if metric is None:
         return None
     if not isinstance(runner, CompGraphRunner):
         raise TypeError(
             "metric is for a runner: a running service has one image at a time. Optimise where it was made."
         )
-    return Searching(runner, metric, direction, cases, ranges)
+    return Search(runner, metric, direction, cases, ranges)
 
 
-def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: State) -> Found:
+def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: Literal["running", "stopping"]) -> Progress:
+    count = len(trials)
+    text = f"Trial {min(count + 1, n)} of {n}" if state == "running" else f"Stopping after {count} of {n} ..."
+    return _progress(state, text, "", n, trials, direction)
+
+
+def _at_end(result: OptimizeResult, n: int) -> Progress:
+    text = f"Stopped after {len(result)} of {n} trials" if result.was_stopped else counted(len(result), "trial")
+    return _progress("done", text, "; none completed", n, result.trials, result.direction, lambda: result.importances)
+
+
+def _progress(
+    state: Literal["running", "stopping", "done"],
+    text: str,
+    without: str,
+    n: int,
+    trials: Sequence[Trial],
+    direction: Direction,
+    importances: Callable[[], Mapping[str, float]] = dict,
+) -> Progress:
     from epypes.batch.optimize import best_of
 
     best = best_of(trials, direction)
-    text = (
-        f"Trial {min(len(trials) + 1, n)} of {n}" if state == "running" else f"Stopping after {len(trials)} of {n} ..."
-    )
-    failed = sum(trial.value is None for trial in trials)
-    text += f", {failed} failed" if failed else ""
-    if best is not None:
-        text += f"; best so far {best.value:.6g}"
-    return _found(state, text, n, trials, best)
-
-
-def _at_end(result: OptimizeResult, n: int) -> Found:
-    from epypes.batch.optimize import best_of
-
-    best = best_of(result.trials, result.direction)
-    failed = f", {len(result.failures)} failed" if result.failures else ""
-    begin = f"Stopped after {len(result)} of {n} trials" if result.was_stopped else counted(len(result), "trial")
-    found = "; none completed" if best is None else f"; best {best.value:.6g}"
-    importances = result.importances if best is not None else {}
-    return _found("done", f"{begin}{failed}{found}", n, result.trials, best, importances)
-
-
-def _found(
-    state: State,
-    text: str,
-    n: int,
-    trials: Sequence[Trial],
-    best: Trial | None,
-    importances: Mapping[str, float] | None = None,
-) -> Found:
     values = tuple(trial.value for trial in trials)
-    place = None if best is None else next(index for index, trial in enumerate(trials) if trial is best)
-    return Found(state, text, n, values, place, None if best is None else best.setting, importances)
-
-
-def _in_words(setting: Mapping[str, Any]) -> str:
-    return ", ".join(f"{token} {said(value)}" for token, value in setting.items())
-
-
-def _tell_nobody(_found: Found) -> None:
-    """Take what nobody looks at yet."""
+    failed = values.count(None)
+    text += f", {failed} failed" if failed else ""
+    if best is None:
+        return Progress(state, text + without, n, values)
+    text += f"; {'best' if state == 'done' else 'best so far'} {best.value:.6g}"
+    place = next(index for index, trial in enumerate(trials) if trial is best)
+    return Progress(state, text, n, values, place, best.setting, importances())

@@ -11,7 +11,7 @@ from skimage import filters
 
 import epypes as ep
 from epypes_widgets.ranges import ranges
-from epypes_widgets.tips import tip
+from epypes_widgets.tooltips import tooltip
 
 
 def documented(image: Any, side: int, low: int, high: int, other: int) -> Any:
@@ -42,12 +42,12 @@ def documented(image: Any, side: int, low: int, high: int, other: int) -> Any:
 def said(function: Any, token: str = "x", param: Any = None, **more: Any) -> str:
     inputs = ("image", token, *more)
     cg = ep.CompGraph({"f": function}, {"f": (inputs, "out")})
-    return tip(cg, token, param)
+    return tooltip(cg, token, param)
 
 
 def all_said(token: str, param: Any = None) -> str:
     cg = ep.CompGraph({"f": documented}, {"f": (("im", "s", "l", "h", "o"), "out")})
-    return tip(cg, token, param)
+    return tooltip(cg, token, param)
 
 
 def test_the_docstring_of_the_function_says_what_a_parameter_is() -> None:
@@ -104,4 +104,4 @@ def test_odd_functions_have_tips_too() -> None:
     assert said(Callable()) == ""
     assert said(cv2.Canny, "p", None, q=1, edges=2, sizes=3).startswith("First threshold")
     cg = ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")})
-    assert tip(cg, "x", ranges(ep.CompGraphRunner(cg, {"x": 70}), {})["x"]) == "Usually 0 to 210."
+    assert tooltip(cg, "x", ranges(ep.CompGraphRunner(cg, {"x": 70}), {})["x"]) == "Usually 0 to 210."

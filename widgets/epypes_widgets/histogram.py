@@ -1,4 +1,4 @@
-"""How often is which value in an image?
+"""The histogram of an image: how often it has which value.
 
 Bins are counted from the value ``low`` to the value ``high``, both included: bin i holds what is nearest to
 ``low + i * (high - low) / (bins - 1)``. What lies beyond, as it may in an image whose display range was kept, is in
@@ -30,8 +30,9 @@ _COLOURS: Final = {"bgr": "BGR", "rgb": "RGB"}
 
 def histogram_of(run: Run, token: str) -> dict[str, Any] | None:
     """Return the histogram of a token that is an image and up to date; None of any other."""
-    found = scene_of(run, token) if _is_image_in(run, token) else None
-    return None if found is None else histogram(found.backdrop)
+    is_shown = is_image(run.tokens.values[run.tokens.program.slots[token]])
+    scene = scene_of(run, token) if is_shown else None
+    return None if scene is None else histogram(scene.backdrop)
 
 
 def histogram(seen: Backdrop) -> dict[str, Any]:
@@ -61,10 +62,6 @@ def histogram(seen: Backdrop) -> dict[str, Any]:
         counts = [_counted(channel, low, high, bins).tolist() for channel in channels]
     names = ["gray"] if sample.ndim == 2 else list(_COLOURS[seen.order])
     return _plain(low, high, dict(zip(names, counts, strict=True)), sample.shape != image.shape)
-
-
-def _is_image_in(run: Run, token: str) -> bool:
-    return is_image(run.tokens.values[run.tokens.program.slots[token]])
 
 
 def _plain(low: float, high: float, channels: dict[str, list[int]], is_sampled: bool) -> dict[str, Any]:

@@ -185,7 +185,7 @@ def test_cases_without_checks_are_test_images_only(runner: ep.CompGraphRunner, i
     panel = tune(runner, cases=images)
     try:
         assert panel.check(TIMEOUT_S) is None
-        assert panel._screen._verdicts is None
+        assert panel._screen.verdicts is None
     finally:
         panel.close(TIMEOUT_S)
 

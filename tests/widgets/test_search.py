@@ -12,7 +12,7 @@ import pytest
 import epypes as ep
 from epypes.errors import StillRunning
 from epypes_widgets import Panel, tune
-from epypes_widgets.searching import Searching
+from epypes_widgets.search import Search
 from tests.widgets.frontend import FrontEnd
 
 TIMEOUT_S = 60.0
@@ -30,7 +30,7 @@ def panel(runner: ep.CompGraphRunner) -> Iterator[Panel]:
     panel.close()
 
 
-def search_of(panel: Panel) -> Searching:
+def search_of(panel: Panel) -> Search:
     assert panel.search is not None
     return panel.search
 

@@ -1,0 +1,127 @@
+"""What a panel tunes: a runner of this process, or a running service.
+
+What is tried on a runner changes nothing, nobody but the user's own cells changes it, and what was found is promoted.
+What is tried on a service is done there, others may tune it at the same time, its events come by themselves, and what
+was found is written back into its bundle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from epypes.graph import CompGraph
+from epypes.run import CompGraphRunner, Run
+
+
+@runtime_checkable
+class Tunable(Protocol):
+    """What a panel tunes: a CompGraphRunner, or the RemoteRunner of a service."""
+
+    @property
+    def cg(self) -> CompGraph:
+        """The graph."""
+        ...
+
+    @property
+    def last(self) -> Run | None:
+        """The last run; None before the first."""
+        ...
+
+    @property
+    def hyperparameters(self) -> Mapping[str, Any]:
+        """The values of the hyperparameters by token: a snapshot."""
+        ...
+
+    @property
+    def first_hyperparameters(self) -> Mapping[str, Any]:
+        """Those that they had at first."""
+        ...
+
+    @property
+    def free_source_tokens(self) -> tuple[str, ...]:
+        """The tokens of the payload."""
+        ...
+
+    @property
+    def stale(self) -> tuple[str, ...]:
+        """The functions whose outputs are out of date."""
+        ...
+
+    @property
+    def running(self) -> tuple[str, ...]:
+        """The functions that are being run."""
+        ...
+
+    def trial(self, values: Mapping[str, Any], /, *targets: str, payload: Mapping[str, Any] | None = None) -> Run:
+        """Return a run with other hyperparameters."""
+        ...
+
+    def adopt(self, run: Run, /) -> bool:
+        """Make it the last one, and its hyperparameters those of now; False if they were changed meanwhile."""
+        ...
+
+    def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
+        """Call something when it has changed; return what ends that."""
+        ...
+
+
+def tunable(given: object) -> Tunable:
+    """Return what is tuned: what was given, or what it has for that, as a connection to a service does.
+
+    Raises
+    ------
+    TypeError
+        It can't be tuned.
+    """
+    to_tune = getattr(given, "to_tune", None)
+    found = given if to_tune is None else to_tune()
+    if not isinstance(found, Tunable):
+        raise TypeError(
+            f"tune() takes a CompGraphRunner or a connection to a service, not {type(given).__name__!r}: "
+            "tune(CompGraphRunner(cg, hparams)), tune(ep.connect(url))."
+        )
+    return found
+
+
+class Target:
+    """What a panel does otherwise for a runner of this process and for a service.
+
+    Attributes
+    ----------
+    owner
+        The object that the line of code calls: the runner, or the connection.
+    name, verb
+        What that is called if it has no name, and its method that sets hyperparameters.
+    is_service
+        Whether others may set hyperparameters too, whose changes are not to be overwritten unseen, and values are
+        written back.
+    """
+
+    def __init__(self, runner: Any) -> None:
+        self._runner = runner
+        self.is_service = not isinstance(runner, CompGraphRunner) and hasattr(runner, "connection")
+        self.owner = runner.connection if self.is_service else runner
+        self.name, self.verb = ("service", "set") if self.is_service else ("runner", "rerun")
+
+    def compared(self, values: Mapping[str, Any], *targets: str) -> Run:
+        """Return a run to compare with, with these hyperparameters and tokens; LookupError if there is none."""
+        run: Run = (self._runner.remembered if self.is_service else self._runner.trial)(values, *targets)
+        return run
+
+    def put(self, values: Mapping[str, Any]) -> None:
+        """Set hyperparameters, whatever runs."""
+        if self.is_service:
+            self._runner.put(values)
+        else:
+            self._runner.set(**values)
+
+    def catch_up(self) -> None:
+        """Take over what others have changed, before the hyperparameters are read."""
+        if self.is_service:
+            self._runner.catch_up()
+
+    @property
+    def notice(self) -> str:
+        """What is wrong with the place where the functions run; empty if nothing is."""
+        return str(self._runner.notice) if self.is_service else ""
