@@ -224,7 +224,7 @@ const answers = {
     kernel.deliver({
       kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images,
       live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
-      code: "runner.rerun()", promote_to: "services/edges", settings: ["good", "dark"], history: [], undo: false, redo: false, token: kernel.token, pinned: [],
+      promote_to: "services/edges", settings: ["good", "dark"], token: kernel.token, pinned: [], closed: false,
     }, [await bytesOf("image", 96), await bytesOf("gray", 96)]);
     await kernel.remember();
     await kernel.run();
