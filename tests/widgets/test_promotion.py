@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.promotion import Outcome, Promotion, proposal
+from epypes_widgets.promotion import Outcome, ReportingJob, proposal, start_promotion
 
 pytestmark = pytest.mark.slow
 
@@ -25,14 +25,14 @@ class Told:
     def __init__(self) -> None:
         self.outcomes: list[Outcome] = []
         self.threads: list[threading.Thread] = []
-        self.promotion = Promotion(self._arrives)
+        self.promotion = ReportingJob("epypes-promotion", self._arrives)
 
     def _arrives(self, outcome: Outcome) -> None:
         self.outcomes.append(outcome)
         self.threads.append(threading.current_thread())
 
     def promoted(self, runner: ep.CompGraphRunner, to: object, outputs: Any = None) -> Outcome:
-        assert self.promotion.start(runner, str(to), outputs)
+        assert start_promotion(self.promotion, runner, str(to), outputs)
         outcome = self.promotion.wait(TIMEOUT_S)
         assert outcome is self.outcomes[-1]
         return outcome
@@ -129,7 +129,7 @@ def test_a_function_that_fails_is_a_refusal_that_names_it(told: Told, tmp_path: 
 def test_outputs_that_are_none_are_refused(told: Told, edges: ep.CompGraphRunner, tmp_path: Path, outputs: Any) -> None:
     outcome = told.promoted(edges, tmp_path / "b", outputs)
     assert outcome.state == "refused"
-    assert outcome.text.startswith("Not promoted:")
+    assert outcome.text.startswith("Not done:")
     assert not (tmp_path / "b").exists()
 
 
@@ -155,16 +155,16 @@ def test_one_promotion_runs_at_a_time(told: Told, tmp_path: Path) -> None:
     runner.run(x=1)
     go_on.clear()
     begun.clear()
-    assert told.promotion.start(runner, str(tmp_path / "a"))
+    assert start_promotion(told.promotion, runner, str(tmp_path / "a"))
     assert begun.wait(TIMEOUT_S)
     assert told.promotion.is_running
-    assert not told.promotion.start(runner, str(tmp_path / "b"))
+    assert not start_promotion(told.promotion, runner, str(tmp_path / "b"))
     assert [outcome.to for outcome in told.outcomes] == [str(tmp_path / "a")]
     with pytest.raises(TimeoutError, match="did not end within"):
         told.promotion.wait(0.01)
     go_on.set()
     told.promotion.wait(TIMEOUT_S)
-    assert told.promotion.start(runner, str(tmp_path / "b")), "after it the next may begin"
+    assert start_promotion(told.promotion, runner, str(tmp_path / "b")), "after it the next may begin"
     told.promotion.wait(TIMEOUT_S)
 
 
@@ -172,9 +172,9 @@ def test_a_report_that_fails_ends_nothing(edges: ep.CompGraphRunner, tmp_path: P
     def broken(_outcome: Outcome) -> None:
         raise RuntimeError("the view is gone")
 
-    promotion = Promotion(broken)
+    promotion = ReportingJob("epypes-promotion", broken)
     assert promotion.wait(0.0) is None
-    assert promotion.start(edges, str(tmp_path / "b"))
+    assert start_promotion(promotion, edges, str(tmp_path / "b"))
     outcome = promotion.wait(TIMEOUT_S)
     assert outcome is not None
     assert outcome.state == "done"

@@ -15,7 +15,7 @@ from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.cases import Cases
 from epypes_widgets.frames import scene
-from epypes_widgets.promotion import Outcome, Promotion, WriteBack
+from epypes_widgets.promotion import Outcome, ReportingJob, start_promotion, start_write_back
 from epypes_widgets.screen import Comparison
 from epypes_widgets.search import Search, search_content
 from epypes_widgets.stages import probe
@@ -49,8 +49,8 @@ class Messages:
     ) -> None:
         self._tuning, self._screen, self._cases, self._search = tuning, tuning.screen, cases, search
         self._save, self._load = save, load
-        self._promotion = Promotion(self._promoted)
-        self._write_back = WriteBack(write_back, self._written)
+        self._write_back, self._promotion = write_back, ReportingJob("epypes-promotion", self._promoted)
+        self._writing = ReportingJob("epypes-write-back", self._written)
         if search is not None:
             search.report = lambda: self._screen.view.tell("optimised", search_content(search) or {})
 
@@ -168,14 +168,14 @@ class Messages:
     def _promote(self, message: Message) -> None:
         runner, to = self._tuning.runner, str(message["to"])
         if isinstance(runner, CompGraphRunner):
-            self._promotion.start(runner, to)
+            start_promotion(self._promotion, runner, to)
         else:
             text = "Not promoted: a running service is a bundle already. Write its values back."
             self._promoted(Outcome("refused", text, to))
 
     def _start_write_back(self, message: Message) -> None:
         if self._tuning.session.target.is_service:
-            self._write_back.start(dry_run=bool(message["dry_run"]))
+            start_write_back(self._writing, self._write_back, dry_run=bool(message["dry_run"]))
         else:
             self._written(Outcome("refused", "Not written: a runner has no bundle to write to. Promote it."))
 

@@ -85,7 +85,7 @@ class Outcome:
     diff: str = ""
 
 
-class _Reporting(Job):
+class ReportingJob(Job):
     """A job that reports its outcomes.
 
     Parameters
@@ -93,7 +93,7 @@ class _Reporting(Job):
     name
         Of the thread.
     report
-        Is called with each ``Outcome``, the last on the job's thread. What it raises is logged.
+        Is called with each ``Outcome``, on the job's thread. What it raises is logged.
     """
 
     def __init__(self, name: str, report: Callable[[Outcome], None]) -> None:
@@ -101,21 +101,23 @@ class _Reporting(Job):
         self._report = report
         self._last: Outcome | None = None
 
-    def wait(self, timeout_s: float) -> Outcome | None:
-        """Return what was reported last once nothing is running; TimeoutError if that takes longer."""
-        self.wait_end(timeout_s)
-        return self._last
+    def start(self, running: Outcome, work: Callable[[], Outcome]) -> bool:
+        """Report what is running, then do it, and report what came of it; return at once, False if some is running."""
 
-    def _start(self, running: Outcome, refused: str, work: Callable[[], Outcome]) -> bool:
-        def report_all() -> None:
+        def report_both() -> None:
             self._tell(running)
             try:
                 outcome = work()
             except BaseException as error:  # a function of the user's may raise anything, SystemExit too
-                outcome = Outcome("refused", f"{refused}: {_text_of(error)}", running.to)
+                outcome = Outcome("refused", _text_of(error), running.to)
             self._tell(outcome)
 
-        return self.run(report_all)
+        return self.run(report_both)
+
+    def wait(self, timeout_s: float) -> Outcome | None:
+        """Return what was reported last once nothing is running; TimeoutError if that takes longer."""
+        self.wait_end(timeout_s)
+        return self._last
 
     def _tell(self, outcome: Outcome) -> None:
         self._last = outcome
@@ -128,35 +130,27 @@ class _Reporting(Job):
 def _text_of(error: BaseException) -> str:
     notes = "".join(f"\n{note}" for note in getattr(error, "__notes__", ()))
     text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error}"
-    return f"{text}{notes}"
+    return text if isinstance(error, PromotionRefused) else f"Not done: {text}{notes}"
 
 
-class Promotion(_Reporting):
-    """Promotes runners.
+def start_promotion(job: ReportingJob, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None = None) -> bool:
+    """Begin to promote a runner and return at once; False, and nothing else, if a promotion is running.
 
-    Notes
-    -----
     The runner's own runs are left alone: its graph is run anew, with its hyperparameters and its last payload, since
     its last run may be a partial one and the next one may begin meanwhile.
+
+    Parameters
+    ----------
+    job
+        Reports the outcome.
+    runner
+        Has been run.
+    to
+        The folder of the bundle, as for ``ep.promote``; ``~`` is the home folder.
+    outputs
+        The tokens that the service answers with; the sink tokens without.
     """
-
-    def __init__(self, report: Callable[[Outcome], None]) -> None:
-        super().__init__("epypes-promotion", report)
-
-    def start(self, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None = None) -> bool:
-        """Begin a promotion and return at once; False, and nothing else, if one is running.
-
-        Parameters
-        ----------
-        runner
-            Has been run.
-        to
-            The folder of the bundle, as for ``ep.promote``; ``~`` is the home folder.
-        outputs
-            The tokens that the service answers with; the sink tokens without.
-        """
-        running = Outcome("running", f"Promoting to {to} ...", to)
-        return self._start(running, "Not promoted", lambda: _promoted(runner, to, outputs))
+    return job.start(Outcome("running", f"Promoting to {to} ...", to), lambda: _promoted(runner, to, outputs))
 
 
 def proposal(token: str | None) -> str:
@@ -180,41 +174,27 @@ def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -
             runner.cg, runner.hyperparameters, guard=runner.guard, check_mutation=runner.check_mutation
         )
         own.run(**{token: last[token] for token in own.free_source_tokens})
-    try:
-        bundle = promote(own, Path(to.strip()).expanduser(), outputs=outputs)
-    except PromotionRefused as refusal:
-        return Outcome("refused", str(refusal), to)
+    bundle = promote(own, Path(to.strip()).expanduser(), outputs=outputs)
     samples = counted(len(bundle.samples), "sample")
     names = f"output{'s' * (len(bundle.settings.outputs) != 1)} {listed(bundle.settings.outputs)}"
     text = f"Promoted to {to.strip()}: {names}; {samples} replayed in a fresh process, identical."
     return Outcome("done", text, to)
 
 
-class WriteBack(_Reporting):
-    """Writes the values of a service back into its bundle.
+def start_write_back(job: ReportingJob, write: Callable[[bool], Any], *, dry_run: bool) -> bool:
+    """Begin to write the values of a service back into its bundle and return at once; False if that is running.
 
     Parameters
     ----------
+    job
+        Reports the outcome.
     write
-        Is called with whether only to show what would change; its answer has ``diff`` and ``digest``.
-    report
-        As for ``Promotion``.
+        Is called with ``dry_run``; its answer has ``diff`` and ``digest``.
+    dry_run
+        Whether to show what would change; nothing is written then.
     """
-
-    def __init__(self, write: Callable[[bool], Any], report: Callable[[Outcome], None]) -> None:
-        super().__init__("epypes-write-back", report)
-        self._write = write
-
-    def start(self, *, dry_run: bool) -> bool:
-        """Begin, and return at once; False, and nothing else, if it is running.
-
-        Parameters
-        ----------
-        dry_run
-            Whether to show what would change; nothing is written then.
-        """
-        text = "Looking at what would change ..." if dry_run else "Writing, and replaying the samples ..."
-        return self._start(Outcome("running", text), "Not written", lambda: _written(self._write(dry_run), dry_run))
+    text = "Looking at what would change ..." if dry_run else "Writing, and replaying the samples ..."
+    return job.start(Outcome("running", text), lambda: _written(write(dry_run), dry_run))
 
 
 def _written(answer: Any, dry_run: bool) -> Outcome:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
-from weakref import ReferenceType, WeakKeyDictionary, ref
 
 from epypes.display import Scene, is_image, scene_of
 from epypes.display.previews.arrays import is_strip, plain_array
@@ -16,15 +15,12 @@ from epypes.graph import colour_order
 from epypes.images import Order
 from epypes.run import Run
 from epypes.run.guard import ARRAYLESS
-from epypes.run.program import Program
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     Array = npt.NDArray[Any]
 
-# Whether a token's last image was one of labels: a pointer asks for many pixels of one image.
-_labels: Final[WeakKeyDictionary[Program, dict[str, tuple[ReferenceType[Any], bool]]]] = WeakKeyDictionary()
 _CHANNELS: Final = {"bgr": "BGRA", "rgb": "RGBA"}
 
 State = Literal["fresh", "stale", "failed", "absent"]
@@ -165,8 +161,10 @@ def probe(run: Run, stages: Iterable[Stage], x: float, y: float, shown: Scene) -
             value = _value(run, token)
             if is_image(value):
                 image = one_channel(plain_array(value))
-                noun = "label " * (image.ndim == 2 and _are_labels(run, token, value))
-                text = noun + _text_at(image, x, y, (width, height), colour_order(run.cg, token))
+                is_label = (
+                    image.ndim == 2 and image.dtype.kind in "iu" and image_kind(image, sampled(image)) == "labels"
+                )
+                text = "label " * is_label + _text_at(image, x, y, (width, height), colour_order(run.cg, token))
                 state = "stale" if run.tokens.is_stale(token) else "fresh"
                 rows.append({"token": token, "text": text, "state": state})
     return rows
@@ -186,17 +184,6 @@ def _pixel_text(image: Array, column: int, row: int, order: Order) -> str:
     if image.ndim == 2:
         return _number(pixel)
     return " ".join(f"{name} {_number(level)}" for name, level in zip(_CHANNELS[order], pixel, strict=False))
-
-
-def _are_labels(run: Run, token: str, value: Array) -> bool:
-    if value.dtype.kind not in "iu":
-        return False
-    seen = _labels.setdefault(run.tokens.program, {})
-    known = seen.get(token)
-    if known is None or known[0]() is not value:
-        image = one_channel(plain_array(value))
-        known = seen[token] = ref(value), image_kind(image, sampled(image)) == "labels"
-    return known[1]
 
 
 def _number(level: float) -> str:

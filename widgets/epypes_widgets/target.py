@@ -7,63 +7,15 @@ was found is written back into its bundle.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Run
 
+if TYPE_CHECKING:
+    from epypes.service.remote.runner import RemoteRunner
 
-@runtime_checkable
-class Tunable(Protocol):
-    """What a panel tunes: a CompGraphRunner, or the RemoteRunner of a service."""
-
-    @property
-    def cg(self) -> CompGraph:
-        """The graph."""
-        ...
-
-    @property
-    def last(self) -> Run | None:
-        """The last run; None before the first."""
-        ...
-
-    @property
-    def hyperparameters(self) -> Mapping[str, Any]:
-        """The values of the hyperparameters by token: a snapshot."""
-        ...
-
-    @property
-    def first_hyperparameters(self) -> Mapping[str, Any]:
-        """Those that they had at first."""
-        ...
-
-    @property
-    def free_source_tokens(self) -> tuple[str, ...]:
-        """The tokens of the payload."""
-        ...
-
-    @property
-    def stale(self) -> tuple[str, ...]:
-        """The functions whose outputs are out of date."""
-        ...
-
-    @property
-    def running(self) -> tuple[str, ...]:
-        """The functions that are being run."""
-        ...
-
-    def trial(self, values: Mapping[str, Any], /, *targets: str, payload: Mapping[str, Any] | None = None) -> Run:
-        """Return a run with other hyperparameters."""
-        ...
-
-    def adopt(self, run: Run, /) -> bool:
-        """Make it the last one, and its hyperparameters those of now; False if they were changed meanwhile."""
-        ...
-
-    def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
-        """Call something when it has changed; return what ends that."""
-        ...
+Tunable: TypeAlias = "CompGraphRunner | RemoteRunner"
 
 
 def tunable(given: object) -> Tunable:
@@ -74,14 +26,14 @@ def tunable(given: object) -> Tunable:
     TypeError
         It can't be tuned.
     """
-    to_tune = getattr(given, "to_tune", None)
-    found = given if to_tune is None else to_tune()
-    if not isinstance(found, Tunable):
+    found: Any = given.to_tune() if hasattr(given, "to_tune") else given
+    if not isinstance(found, CompGraphRunner) and not hasattr(found, "connection"):
         raise TypeError(
             f"tune() takes a CompGraphRunner or a connection to a service, not {type(given).__name__!r}: "
             "tune(CompGraphRunner(cg, hparams)), tune(ep.connect(url))."
         )
-    return found
+    tuned: Tunable = found
+    return tuned
 
 
 class Target:
@@ -100,7 +52,7 @@ class Target:
 
     def __init__(self, runner: Any) -> None:
         self._runner = runner
-        self.is_service = not isinstance(runner, CompGraphRunner) and hasattr(runner, "connection")
+        self.is_service = not isinstance(runner, CompGraphRunner)
         self.owner = runner.connection if self.is_service else runner
         self.name, self.verb = ("service", "set") if self.is_service else ("runner", "rerun")
 

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from time import perf_counter_ns
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StillRunning
-from epypes.graph import CompGraph
+from epypes.graph import subgraph
 from epypes.run import Failure, Run
 from epypes_widgets.control_set import ControlSet
 from epypes_widgets.frames import thumbnail
@@ -327,9 +326,9 @@ class Tuning:
         if function not in cg.functions:
             return []  # f_in or f_out of a service
         takes = cg.func_inputs(function)
-        given = [name for name in takes if name in wanted]
-        behind = (name for name in _upstream(cg, function) if name in wanted)
-        return given or list(behind) or [name for name in takes if name in run.hyperparameters]
+        behind = subgraph(cg, takes).tokens
+        given = [name for name in takes if name in wanted] or [name for name in wanted if name in behind]
+        return given or [name for name in takes if name in run.hyperparameters]
 
     def _commit(self, *, is_final: bool = False) -> None:
         """Add the values that the runner has taken over to the history, unless they are there or held."""
@@ -379,16 +378,3 @@ class Tuning:
         if entry is None:
             raise LookupError(f"No entry {comparison.number} in the history.")
         return entry.values, f"history {entry.number}"
-
-
-def _upstream(cg: CompGraph, function: str) -> Iterator[str]:
-    """Yield the tokens that a function takes, then those that they are made from."""
-    seen = dict.fromkeys(cg.func_inputs(function))
-    waiting = deque(seen)
-    while waiting:
-        token = waiting.popleft()
-        yield token
-        maker = cg.digraph.producer.get(token)
-        found = [] if maker is None else [name for name in cg.func_inputs(maker) if name not in seen]
-        seen.update(dict.fromkeys(found))
-        waiting.extend(found)

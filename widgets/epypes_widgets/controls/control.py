@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import ipywidgets
-import traitlets
 from ipywidgets.widgets.widget_bool import CheckboxStyle
 from ipywidgets.widgets.widget_int import SliderStyle
 
@@ -30,36 +29,29 @@ _MAX_TEXT: Final = 2_000
 _DESCRIPTION_WIDTH: Final = "112px"
 
 
-# ipywidgets sends each value back, for other views of the same kernel. That message would arrive right before the
-# picture and delay it, so these do not.
-class QuietIntSlider(ipywidgets.IntSlider):
-    """A slider of whole numbers."""
+class _Quiet(ipywidgets.Widget):
+    """A slider that does not send its value back to the front end.
 
-    value = traitlets.CInt(0).tag(sync=True, echo_update=False)
+    ipywidgets does, for other views of the same kernel. That message would arrive right before the picture and delay it.
+    """
 
-
-class QuietFloatSlider(ipywidgets.FloatSlider):
-    """A slider of numbers."""
-
-    value = traitlets.CFloat(0.0).tag(sync=True, echo_update=False)
+    def trait_metadata(self, traitname: str, key: str, default: Any = None) -> Any:
+        return False if key == "echo_update" else super().trait_metadata(traitname, key, default)
 
 
-class QuietLogSlider(ipywidgets.FloatLogSlider):
-    """A slider of exponents."""
-
-    value = traitlets.CFloat(1.0).tag(sync=True, echo_update=False)
+class _IntSlider(_Quiet, ipywidgets.IntSlider): ...
 
 
-class QuietIntRange(ipywidgets.IntRangeSlider):
-    """A slider of whole numbers with two ends."""
-
-    value = traitlets.Tuple(traitlets.CInt(), traitlets.CInt()).tag(sync=True, echo_update=False)
+class _FloatSlider(_Quiet, ipywidgets.FloatSlider): ...
 
 
-class QuietFloatRange(ipywidgets.FloatRangeSlider):
-    """A slider of numbers with two ends."""
+class _LogSlider(_Quiet, ipywidgets.FloatLogSlider): ...
 
-    value = traitlets.Tuple(traitlets.CFloat(), traitlets.CFloat()).tag(sync=True, echo_update=False)
+
+class _IntRange(_Quiet, ipywidgets.IntRangeSlider): ...
+
+
+class _FloatRange(_Quiet, ipywidgets.FloatRangeSlider): ...
 
 
 class Appearance:
@@ -225,9 +217,9 @@ class SliderControl(Control):
         widget: Any
         if scale.param.log:
             low, high = exponent(min(scale.low, value)), exponent(max(scale.high, value))
-            widget = QuietLogSlider(value=float(value), base=10, min=low, max=high, **common)
+            widget = _LogSlider(value=float(value), base=10, min=low, max=high, **common)
         else:
-            slider = QuietIntSlider if scale.integer else QuietFloatSlider
+            slider = _IntSlider if scale.integer else _FloatSlider
             widget = slider(value=scale.place(value), min=scale.low, max=scale.high, **common)
         self._slider, self._scale, self._snap = widget, scale, _Snap(scale, scale.step)
         self._snap.put(value, widget.value)
@@ -261,7 +253,7 @@ class RangeControl(Control):
     def __init__(self, scales: tuple[Scale, Scale], values: _Two, first: _Two, appearance: Mapping[str, Any]) -> None:
         low, high = scales
         self.integer, self.steps = low.integer and high.integer, (low.step, high.step)
-        slider = QuietIntRange if self.integer else QuietFloatRange
+        slider = _IntRange if self.integer else _FloatRange
         places = low.place(values[0]), high.place(values[1])
         ends = {"min": min(low.low, high.low), "max": max(low.high, high.high), "step": min(low.step, high.step)}
         widget = slider(value=places, **ends, readout=False, continuous_update=False, **appearance)
