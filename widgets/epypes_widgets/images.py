@@ -8,17 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any, Final
 
-from epypes.display import is_image
-from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.imagekinds import image_kind, sampled
-from epypes.display.previews.kinds import is_array
-from epypes.display.previews.looking import silent_numpy
-from epypes.display.previews.raster import encode_small, pillow_image
+from epypes.display import encode_image, is_image
 from epypes.errors import PayloadError, UnknownName
 from epypes.graph import colour_order
+from epypes.run.guard import is_array
 from epypes_widgets.target import Tunable
 
 _THUMBNAIL_PX: Final = 96
+_THUMBNAIL_BYTES: Final = 5_000
 _TITLE_CHARACTERS: Final = 40
 
 
@@ -33,7 +30,7 @@ class Payload:
     values
         By free source token, for ``runner.run(**values)``.
     thumbnail
-        A JPEG of at most 96 x 96 pixels; empty if none of its values is an image.
+        A picture of at most 96 x 96 pixels; empty if none of its values is an image.
     """
 
     title: str
@@ -130,8 +127,5 @@ def _thumbnail(runner: Tunable, payload: Mapping[str, Any]) -> bytes:
     token = next((token for token, value in payload.items() if is_image(value)), None)
     if token is None:
         return b""
-    image = plain_array(payload[token])
-    with silent_numpy():
-        kind = image_kind(image, sampled(image))
-        picture = pillow_image(image, _THUMBNAIL_PX, colour_order(runner.cg, token), None, kind)
-    return encode_small(picture.convert("RGB")).data
+    order = colour_order(runner.cg, token)
+    return encode_image(payload[token], _THUMBNAIL_PX, order, most_bytes=_THUMBNAIL_BYTES).data

@@ -32,7 +32,8 @@ _DESCRIPTION_WIDTH: Final = "112px"
 class _Quiet(ipywidgets.Widget):
     """A slider that does not send its value back to the front end.
 
-    ipywidgets does, for other views of the same kernel. That message would arrive right before the picture and delay it.
+    ipywidgets does, for other views of the same kernel. That message would arrive right before the picture.
+
     """
 
     def trait_metadata(self, traitname: str, key: str, default: Any = None) -> Any:
