@@ -33,7 +33,6 @@ class _Quiet(ipywidgets.Widget):
     """A slider that does not send its value back to the front end.
 
     ipywidgets does, for other views of the same kernel. That message would arrive right before the picture.
-
     """
 
     def trait_metadata(self, traitname: str, key: str, default: Any = None) -> Any:

@@ -6,19 +6,25 @@ import { newestNext } from "./protocol.js";
 /** The URL of what an image shows, revoked when it shows something else. */
 const shownUrls = new WeakMap();
 
-/** Show bytes in an image in place of those before; return whether they are shown: not if newer ones came, or they are no picture. */
-export async function swap(img, bytes, type) {
+/**
+ * Show bytes in an image in place of those before, which stay until these have been loaded. Resolves when the next paint
+ * has them: with whether they are shown, which they are not if newer ones came, or if they are no picture.
+ */
+export function swap(img, bytes, type) {
   const url = URL.createObjectURL(new Blob([bytes], { type }));
-  img.src = url;
-  try {
-    await img.decode();
-  } catch {
-    URL.revokeObjectURL(url);
-    if (img.src === url) img.src = shownUrls.get(img) ?? "";
-    return false;
-  }
-  clear(img, url);
-  return true;
+  return new Promise((resolve) => {
+    const over = new AbortController();
+    const end = (event) => {
+      over.abort();
+      const isShown = img.src === url && event.type === "load";
+      if (isShown) clear(img, url);
+      else URL.revokeObjectURL(url);
+      if (img.src === url && !isShown) img.src = shownUrls.get(img) ?? "";
+      resolve(isShown);
+    };
+    for (const type of ["load", "error"]) img.addEventListener(type, end, { signal: over.signal });
+    img.src = url;
+  });
 }
 
 /** Give back the bytes that an image shows, for other ones or for none. */

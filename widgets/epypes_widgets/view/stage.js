@@ -57,8 +57,8 @@ export function inBox(place, pixel) {
 
 /** The picture, the one that it is compared with, and the drawings above them. */
 export function stagePart() {
-  const picture = element("img", "epypes-picture", { alt: "", hidden: "", draggable: "false" });
-  const other = element("img", "epypes-other", { alt: "", draggable: "false" });
+  const picture = element("img", "epypes-picture", { alt: "", decoding: "sync", hidden: "", draggable: "false" });
+  const other = element("img", "epypes-other", { alt: "", decoding: "sync", draggable: "false" });
   const [overlay, otherMarks] = [overlaySvg(), overlaySvg()];
   const roi = shape("svg", { class: "epypes-roi", preserveAspectRatio: "none" });
   // Above the marks of the big picture: where it is seen, these are not.
