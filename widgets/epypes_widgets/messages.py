@@ -17,7 +17,7 @@ from epypes_widgets.cases import Cases
 from epypes_widgets.frames import scene
 from epypes_widgets.promotion import Outcome, ReportingJob, start_promotion, start_write_back
 from epypes_widgets.screen import Comparison
-from epypes_widgets.search import Search, search_content
+from epypes_widgets.search import Search
 from epypes_widgets.stages import probe
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.view import Handler, Message
@@ -52,7 +52,7 @@ class Messages:
         self._write_back, self._promotion = write_back, ReportingJob("epypes-promotion", self._promoted)
         self._writing = ReportingJob("epypes-write-back", self._written)
         if search is not None:
-            search.report = lambda: self._screen.view.tell("optimised", search_content(search) or {})
+            search.report = lambda: self._screen.view.tell("optimised", search.content())
 
     @property
     def handlers(self) -> dict[str, Handler]:
@@ -93,7 +93,7 @@ class Messages:
         return {
             "optimise": lambda message: search.start(int(message["n"])),
             "optimise_stop": lambda _: search.stop(),
-            "optimise_use": lambda _: self._set(search.progress.setting or {}, by_user=False),
+            "optimise_use": lambda _: self._set(search.best.setting if search.best else {}, by_user=False),
         }
 
     def _ready(self, _message: Message) -> None:

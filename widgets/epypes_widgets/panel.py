@@ -23,7 +23,7 @@ from epypes_widgets.images import payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
-from epypes_widgets.search import Search, search_content, search_of
+from epypes_widgets.search import Search, search_of
 from epypes_widgets.session import Session
 from epypes_widgets.static import StaticOutput, static_html
 from epypes_widgets.target import tunable
@@ -360,7 +360,7 @@ class Panel:
             "promote_to": proposal(self.token),
             "writes_back": self._session.target.is_service,
             "settings": list(settings.names(".")),
-            "optimise": search_content(self.search),
+            "optimise": None if self.search is None else self.search.content(),
         }
         return content, [image.thumbnail for image in images]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -27,36 +26,7 @@ FIRST_N: Final = 50
 MAX_TRIALS: Final = 10_000
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a search has come.
-
-    Attributes
-    ----------
-    state
-        ``"idle"`` before the first one; ``"running"``; ``"stopping"`` when the button was pressed and a function still
-        runs; ``"done"``, ended or stopped; ``"refused"`` if it could not be begun or all trials failed.
-    text
-        For the user.
-    n
-        How many trials there are to be.
-    values
-        The metric, trial by trial; None for one that failed.
-    best
-        The place of the best one among them; None if none completed.
-    setting
-        The values of the hyperparameters in that one, by token.
-    importances
-        How much each matters, as parts of 1; empty before the end.
-    """
-
-    state: Literal["idle", "running", "stopping", "done", "refused"] = "idle"
-    text: str = ""
-    n: int = FIRST_N
-    values: tuple[float | None, ...] = ()
-    best: int | None = None
-    setting: Mapping[str, Any] | None = None
-    importances: Mapping[str, float] | None = None
+State = Literal["idle", "running", "stopping", "done", "refused"]
 
 
 class Search(Job):
@@ -75,10 +45,6 @@ class Search(Job):
     ----------
     result
         What ``ep.optimize`` returned last; None before.
-    progress
-        What was reported last.
-    reports
-        How often something was reported.
     report
         Is called when there is progress, on any thread. What it raises is logged.
     """
@@ -92,35 +58,47 @@ class Search(Job):
         ranges: Callable[[], Mapping[str, Any]],
     ) -> None:
         super().__init__("epypes-search")
-        self.metric: str = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
-        self.direction = direction
         self.result: OptimizeResult | None = None
-        self.progress, self.reports = Progress(), 0
         self.report: Callable[[], None] = lambda: None
-        self._runner, self._measure, self._cases, self._ranges = runner, metric, cases, ranges
+        self._runner, self._metric, self._direction, self._cases, self._ranges = (
+            runner,
+            metric,
+            direction,
+            cases,
+            ranges,
+        )
         # Held while reporting, so that nothing older comes after something newer.
         self._reporting = threading.RLock()
         self._stop = threading.Event()
+        # "stopping" when the button was pressed and a function still runs, "refused" if all failed.
+        self._state: State = "idle"
+        self._n, self._refusal, self._reports, self._reported_s = FIRST_N, "", 0, 0.0
         self._trials: list[Trial] = []
-        self._reported_s = 0.0
+        self._importances: Mapping[str, float] = {}
+
+    @property
+    def best(self) -> Trial | None:
+        """The best trial until now; None if none completed."""
+        from epypes.batch.optimize import best_of
+
+        return best_of(self._trials, self._direction)
 
     def start(self, n: int = FIRST_N) -> bool:
         """Begin a search of so many trials and return at once; False, and nothing else, if one is running."""
-        n = min(max(1, n), MAX_TRIALS)
         with self._reporting:
             if self.is_running:
                 return False
             self._stop.clear()
-            self._trials = []
-            self._tell(Progress("running", f"Trial 1 of {n} ...", n))
-            return self.run(lambda: self._search(n))
+            self._n, self._trials, self._importances = min(max(1, n), MAX_TRIALS), [], {}
+            self._tell("running")
+            return self.run(self._search)
 
     def stop(self) -> None:
         """Have the search end when the case that runs has ended; return at once."""
         with self._reporting:
             if self.is_running and not self._stop.is_set():
                 self._stop.set()
-                self._tell(_so_far(self._trials, self.direction, self.progress.n, "stopping"))
+                self._tell("stopping")
 
     def wait(self, timeout_s: float) -> OptimizeResult | None:
         """Return the result once nothing is running; TimeoutError if that takes longer."""
@@ -133,29 +111,64 @@ class Search(Job):
         if not self._ended.wait(timeout_s):
             raise StillRunning(self._name, (), timeout_s)
 
-    def _search(self, n: int) -> None:
+    def content(self) -> dict[str, Any]:
+        """Return what a view gets, ready for JSON."""
+        with self._reporting:
+            best, metric = self.best if self._trials else None, self._metric
+            values = [trial.value for trial in self._trials]
+            return {
+                "state": self._state,
+                "text": self._refusal if self._state == "refused" else self._text(best, values.count(None)),
+                "n": self._n,
+                "values": values,
+                "best": next((place for place, trial in enumerate(self._trials) if trial is best), None),
+                "setting": "" if best is None else setting_text(best.setting),
+                "importances": [[name, part] for name, part in self._importances.items()],
+                "metric": self._metric
+                if isinstance(self._metric, str)
+                else getattr(self._metric, "__name__", "metric"),
+                "direction": self._direction,
+                "seq": self._reports,
+            }
+
+    def _text(self, best: Trial | None, failed: int) -> str:
+        count, is_done = len(self._trials), self._state == "done"
+        text = {
+            "idle": "",
+            "running": f"Trial {min(count + 1, self._n)} of {self._n}",
+            "stopping": f"Stopping after {count} of {self._n} ...",
+            "done": f"Stopped after {count} of {self._n} trials" if self._stop.is_set() else counted(count, "trial"),
+        }[self._state]
+        text += f", {failed} failed" if failed else ""
+        if best is None:
+            return text + "; none completed" * is_done
+        return f"{text}; {'best' if is_done else 'best so far'} {best.value:.6g}"
+
+    def _search(self) -> None:
         from epypes.batch.optimize import optimize
 
+        state: State = "refused"
         try:
             self.result = optimize(
                 self._runner,
-                self._measure,
+                self._metric,
                 self._last_payload() if self._cases is None else self._cases,
-                n,
-                direction=self.direction,
+                self._n,
+                direction=self._direction,
                 ranges={name: param for name, param in self._ranges().items() if isinstance(param, Param)},
                 stop=self._stop,
                 on_trial=self._tried,
                 progress=False,
             )
-            progress = _at_end(self.result, n)
+            self._trials, state = list(self.result.trials), "done"
+            self._importances = self.result.importances if self.best is not None else {}
         except EpypesError as error:
-            progress = Progress("refused", str(error), n, tuple(trial.value for trial in self._trials))
+            self._refusal = str(error)
         except BaseException as error:  # a generator of cases, for example, may raise anything
             _LOG.exception("A search has failed")
-            progress = Progress("refused", f"{type(error).__name__}: {error}", n)
+            self._refusal = f"{type(error).__name__}: {error}"
         with self._reporting:
-            self._tell(progress)
+            self._tell(state)
             self._ended.set()
 
     def _last_payload(self) -> list[Mapping[str, Any]]:
@@ -165,40 +178,18 @@ class Search(Job):
         return [{token: last[token] for token in self._runner.free_source_tokens}]
 
     def _tried(self, trial: Trial) -> None:
-        self._trials.append(trial)
-        now_s = monotonic()
-        if now_s - self._reported_s < _REPORT_S:
-            return
-        self._reported_s = now_s
         with self._reporting:
-            if not self._stop.is_set():
-                self._tell(_so_far(self._trials, self.direction, self.progress.n, "running"))
+            self._trials.append(trial)
+            if monotonic() - self._reported_s >= _REPORT_S and not self._stop.is_set():
+                self._reported_s = monotonic()
+                self._tell("running")
 
-    def _tell(self, progress: Progress) -> None:
-        self.progress, self.reports = progress, self.reports + 1
+    def _tell(self, state: State) -> None:
+        self._state, self._reports = state, self._reports + 1
         try:
             self.report()
         except Exception:
             _LOG.exception("How far a search has come could not be shown")
-
-
-def search_content(search: Search | None) -> dict[str, Any] | None:
-    """Return what a view gets of a search, ready for JSON; None if there is none."""
-    if search is None:
-        return None
-    progress = search.progress
-    return {
-        "state": progress.state,
-        "text": progress.text,
-        "n": progress.n,
-        "values": list(progress.values),
-        "best": progress.best,
-        "setting": setting_text(progress.setting or {}),
-        "importances": [[name, part] for name, part in (progress.importances or {}).items()],
-        "metric": search.metric,
-        "direction": search.direction,
-        "seq": search.reports,
-    }
 
 
 def search_of(
@@ -212,36 +203,3 @@ def search_of(
             "metric is for a runner: a running service has one image at a time. Optimise where it was made."
         )
     return Search(runner, metric, direction, cases, ranges)
-
-
-def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: Literal["running", "stopping"]) -> Progress:
-    count = len(trials)
-    text = f"Trial {min(count + 1, n)} of {n}" if state == "running" else f"Stopping after {count} of {n} ..."
-    return _progress(state, text, "", n, trials, direction)
-
-
-def _at_end(result: OptimizeResult, n: int) -> Progress:
-    text = f"Stopped after {len(result)} of {n} trials" if result.was_stopped else counted(len(result), "trial")
-    return _progress("done", text, "; none completed", n, result.trials, result.direction, lambda: result.importances)
-
-
-def _progress(
-    state: Literal["running", "stopping", "done"],
-    text: str,
-    without: str,
-    n: int,
-    trials: Sequence[Trial],
-    direction: Direction,
-    importances: Callable[[], Mapping[str, float]] = dict,
-) -> Progress:
-    from epypes.batch.optimize import best_of
-
-    best = best_of(trials, direction)
-    values = tuple(trial.value for trial in trials)
-    failed = values.count(None)
-    text += f", {failed} failed" if failed else ""
-    if best is None:
-        return Progress(state, text + without, n, values)
-    text += f"; {'best' if state == 'done' else 'best so far'} {best.value:.6g}"
-    place = next(index for index, trial in enumerate(trials) if trial is best)
-    return Progress(state, text, n, values, place, best.setting, importances())
