@@ -156,7 +156,7 @@ def thumbnail(run: Run, token: str | None) -> Picture | None:
 def scene(run: Run, token: str, *, had_marks: bool = False) -> Scene | None:
     """Return the image as which a token is shown, with all marks that the screen gets; None if it is shown as text.
 
-    ``had_marks`` says that the token had a picture in an earlier run: if nothing is found any more, the image is left.
+    ``had_marks``: whether the token had a picture in an earlier run: if nothing is found any more, the image is left.
     """
     return scene_of(run, token, MAX_DRAWN, had_marks=had_marks)
 

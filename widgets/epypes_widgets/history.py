@@ -17,7 +17,6 @@ from epypes.display import Picture
 from epypes.optional import optional_import
 from epypes.store import Store, opened_store
 from epypes.store.writer import SeriesWriter
-from epypes_widgets.images import is_alike
 from epypes_widgets.target import Tunable
 from epypes_widgets.values import change_text, differing, json_value
 
@@ -34,7 +33,7 @@ _lock = threading.Lock()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """Values that were committed; entries are told apart by identity, since values may be arrays.
+    """Values that were committed; entries are compared by identity, since values may be arrays.
 
     Attributes
     ----------
@@ -97,8 +96,6 @@ class History:
         self._path: tuple[Entry, ...] = ()
         self._place = -1
         self._committed = 0
-        self._images: tuple[Any, ...] = ()
-        self._images_from = 1
         self._watchers: tuple[Callable[[Entry], object], ...] = ()
 
     def watch(self, callback: Callable[[Entry], object]) -> Callable[[], None]:
@@ -167,16 +164,6 @@ class History:
                 self._path = (*self._path[: self._place + 1], entry)
             self._place = self._path.index(entry)
         return self._report(entry)
-
-    def use_images(self, images: tuple[Any, ...]) -> None:
-        """Know which images the indices of entries mean from now on; earlier ones go on meaning these very images."""
-        with self._lock:
-            if len(images) != len(self._images) or not all(map(is_alike, images, self._images)):
-                self._images, self._images_from = images, self._committed + 1
-
-    def is_of_images(self, entry: Entry) -> bool:
-        """Whether the index of an entry's image means one of the present images."""
-        return entry.image is not None and entry.number >= self._images_from
 
     @property
     def current(self) -> Entry | None:

@@ -84,8 +84,6 @@ class Panel:
         self._controls, self._session, self._runner, self.search = controls, session, session.runner, search
         cg: CompGraph = self._runner.cg
         self._history = history_of(self._runner)
-        if session.payloads:
-            self._history.use_images(tuple(value for payload in session.payloads for value in payload.values.values()))
         self._column = column(cg, controls.controls)
         self._worker = worker = Worker(self._report)
         view = PictureView(
@@ -394,12 +392,12 @@ def tune(
     tuned
         A runner that has been run, so that there is a payload, unless ``images`` are given. Or what ``ep.connect``
         has returned: then the picture follows the service's own events, values are set there, with their revision, and
-        what somebody else sets at the same time is never overwritten unseen.
+        what other clients set at the same time is never overwritten unseen.
     images
         Test images to switch between: values of the one free source token, or dicts by token. A service has none.
     cases
         A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
-        says whether it passes with the values that were committed last. A service has none.
+        shows whether it passes with the values that were committed last. A service has none.
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
         image.
@@ -414,7 +412,7 @@ def tune(
         The name of the series there; without, those of the sink tokens.
     hints
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
-        Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
+        Without, the annotation of the function that takes it counts, then the table of OpenCV's and scikit-image's
         parameters, then its value; what can't be moved is shown. A hyperparameter called as one of the above gets
         its hint from its annotation.
 
@@ -440,7 +438,7 @@ def tune(
     ServiceError
         The service is gone.
     StoreError
-        There can be no such database. One that is away for now is told in the panel's log.
+        There can be no such database. One that is away for now is reported in the panel's log.
 
     Examples
     --------

@@ -41,7 +41,7 @@ def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
     -------
     dict
         By token. A Param has choices, or two hard ends, or ``soft``. Of two tokens that bound a range, the lower one
-        says so by ``below``.
+        names the other by ``below``.
 
     Raises
     ------
@@ -290,7 +290,7 @@ def _words(name: str) -> tuple[str, ...]:
 
 
 def _paired(runner: Tunable, found: Mapping[str, Range], given: Mapping[str, Range]) -> dict[str, Range]:
-    """Return ranges in which the lower one of two tokens says so by ``below``.
+    """Return ranges in which the lower one of two tokens names the other by ``below``.
 
     A hint's ``below`` is kept, or refused with ValueError. Else two tokens are a pair if they go into one function,
     neither has a hint, their names or those of their parameters differ by low and high, and their values are of one

@@ -15,7 +15,7 @@ from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
 from epypes_widgets.session import Session
-from epypes_widgets.stages import Stage, best_stage, is_fresh, stages, states
+from epypes_widgets.stages import Stage, best_stage, stages, states
 from epypes_widgets.target import Tunable
 from epypes_widgets.values import json_values
 from epypes_widgets.view import PictureView
@@ -149,7 +149,6 @@ class Screen:
         self._is_closed = False
         self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
-        self._seen_token: str | None = None
         # Held while the history is sent, so that what is sent last is the newest.
         self._listing = threading.Lock()
         self._pictured: set[int] = set()
@@ -169,11 +168,6 @@ class Screen:
         if not any(stage.token == token for stage in self.stages):
             raise LookupError(f"{token!r} has no picture here.")
         return str(token)
-
-    def token_in(self, run: Run) -> str | None:
-        """Return the token that is seen in a run: the one before, while one chosen just now is not computed."""
-        token = self.shown.token
-        return token if token is None or is_fresh(run, token) else self._seen_token
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
@@ -196,8 +190,6 @@ class Screen:
             if self._note["waits"]:
                 self.note("")
             self.compute_ms = run.report.total_ns / 1e6
-        if is_fresh(run, shown.token):
-            self._seen_token = shown.token
         frame = make_frame(
             run,
             shown.token,
@@ -218,7 +210,7 @@ class Screen:
         self.view.tell("error", self._failure)
 
     def note(self, text: str, *, waits: bool = False) -> None:
-        """Say something that is no failure; it stays until something else is said, or nothing.
+        """Say something that is no failure; it stays until another text, or none.
 
         What is waited for stands in the picture's place if there is none yet.
         """

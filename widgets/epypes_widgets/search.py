@@ -114,7 +114,8 @@ class Search(Job):
     def content(self) -> dict[str, Any]:
         """Return what a view gets, ready for JSON."""
         with self._reporting:
-            best, metric = self.best if self._trials else None, self._metric
+            best = self.best if self._trials else None
+            metric = self._metric if isinstance(self._metric, str) else getattr(self._metric, "__name__", "metric")
             values = [trial.value for trial in self._trials]
             return {
                 "state": self._state,
@@ -124,9 +125,7 @@ class Search(Job):
                 "best": next((place for place, trial in enumerate(self._trials) if trial is best), None),
                 "setting": "" if best is None else setting_text(best.setting),
                 "importances": [[name, part] for name, part in self._importances.items()],
-                "metric": self._metric
-                if isinstance(self._metric, str)
-                else getattr(self._metric, "__name__", "metric"),
+                "metric": metric,
                 "direction": self._direction,
                 "seq": self._reports,
             }

@@ -51,7 +51,7 @@ def stages(run: Run, kept: Iterable[Stage] = (), asked: str | None = None) -> tu
         Its values are looked at, those that are stale only for whether they are images.
     kept
         The stages of an earlier run: what had a picture stays, whether or not it has one now, so that nothing comes
-        and goes under the hand.
+        and goes while values are moved.
     asked
         A token that is a stage in any case.
 
@@ -96,11 +96,6 @@ def states(run: Run, stages: Iterable[Stage]) -> dict[str, State]:
     return {stage.token: _state(run, stage.token) for stage in stages}
 
 
-def is_fresh(run: Run, token: str) -> bool:
-    """Whether a run has a value of a token that belongs to its other values."""
-    return _state(run, token) == "fresh"
-
-
 def _state(run: Run, token: str) -> State:
     maker = run.cg.digraph.producer.get(token)
     if run.failure is not None and maker == run.failure.function:
@@ -143,7 +138,7 @@ def probe(run: Run, stages: Iterable[Stage], x: float, y: float, shown: Scene) -
         Where, in pixels of the picture that is shown; the first pixel reaches from 0 to 1.
     shown
         The picture in which the pixel was chosen. In an image of another size than its backdrop's the pixel at the same
-        place is taken, and its column and row are told.
+        place is taken, and its column and row are given.
 
     Returns
     -------

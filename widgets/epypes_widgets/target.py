@@ -1,6 +1,6 @@
 """What a panel tunes: a runner of this process, or a running service.
 
-What is tried on a runner changes nothing, nobody but the user's own cells changes it, and what was found is promoted.
+What is tried on a runner changes nothing, only the user's own cells change it, and what was found is promoted.
 What is tried on a service is done there, others may tune it at the same time, its events come by themselves, and what
 was found is written back into its bundle.
 """

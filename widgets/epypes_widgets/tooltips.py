@@ -22,7 +22,7 @@ _SIGNATURE: Final = re.compile(r"^[\w.]+\(.*\)(\s*->.*)?$")
 def tooltip(cg: CompGraph, token: str, param: Range) -> str:
     """Return what is known of a hyperparameter in one line of plain text, at most 300 characters.
 
-    It is what the docstring of a function that takes it says of its parameter, else what the hint says, else the first
+    It is the text on the parameter in the docstring of a function that takes it, else the hint's, else the first
     line of the docstring; then the unit and the range.
     """
     about, facts = next(_abouts(cg, token, param), ""), _facts(param)
@@ -70,7 +70,7 @@ def _numpydoc(section: str, parameter: str) -> str:
 
 
 def _doxygen(docstring: str, parameter: str) -> str:
-    """Return what OpenCV says: ``.   @param ksize blurring kernel size.``."""
+    """Return the text of OpenCV: ``.   @param ksize blurring kernel size.``."""
     bare = re.sub(r"^\.?[ \t]*", "", docstring, flags=re.MULTILINE)
     found = re.search(rf"^@param {re.escape(parameter)} (.*?)(?=^@|\n\n|\Z)", bare, re.MULTILINE | re.DOTALL)
     return _one_line(re.sub(r"\\f\$|\\texttt|\\ref |#(?=\w)|[{}]", "", found[1])) if found else ""

@@ -152,7 +152,7 @@ class Tuning:
         with self._lock:
             self._log(self.controls.follow(values))
             self.session.want(values)
-        if self.history.is_of_images(entry) and entry.image not in (None, self.session.image_wanted):
+        if entry.image not in (None, self.session.image_wanted) and entry.image in range(len(self.session.payloads)):
             self.session.want_image(entry.image or 0)
         self._is_forced = True
         self._request()
@@ -345,7 +345,7 @@ class Tuning:
         current, image = self.history.current, self.session.image
         if not self.session.payloads and current is not None:
             image = current.image  # that of another panel on this runner
-        token = self.screen.token_in(run)
+        token = self.screen.shown.token
         about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms}
         self.history.commit(run.hyperparameters, image=image, token=token, **about)
 

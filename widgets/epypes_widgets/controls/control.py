@@ -72,7 +72,7 @@ class Appearance:
 class Control:
     """One or two hyperparameters on screen; its methods may be called from any thread.
 
-    A subclass says how its values and its widget belong together: ``_read``, ``_checked`` and ``_place`` for values by
+    A subclass connects its values with its widget: by ``_read``, ``_checked`` and ``_place`` for values by
     token, or ``_get``, ``_check`` and ``_put`` for the value of its one token.
 
     Attributes

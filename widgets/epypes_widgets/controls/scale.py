@@ -13,7 +13,7 @@ from epypes.hints import Param, odd_step
 from epypes_widgets.ranges import allows, range_text
 from epypes_widgets.values import is_integer, is_number, numpy_type
 
-# A browser's numbers are floats: whole ones beyond this can't be told from their neighbours.
+# A browser's numbers are floats: whole ones beyond this are the same as their neighbours.
 _LAST_WHOLE: Final = 2**53
 # What a power of ten may be, so that neither it nor what is near to it is 0 or infinite.
 _EXPONENTS: Final = (-300.0, 308.0)
@@ -30,7 +30,7 @@ class Scale:
     param
         Its range.
     first
-        The value that says of which type the others are.
+        A value of the type that all others get.
     integer
         Whether all values are whole.
     low, high
@@ -70,7 +70,7 @@ class Scale:
         """Return the shortest decimal number that is surely meant by a place."""
         if not self.param.log:
             return without_noise(place, self.step)
-        # Two places differ by this share of them; digits far below it are of the scale, not of the hand.
+        # Two places differ by this share of them; digits far below it are of the scale, not of the user.
         share = math.expm1(self.step * math.log(10))
         return float(f"{place:.{max(3, 2 - math.floor(math.log10(share)))}g}")
 
@@ -146,7 +146,7 @@ def exponent(value: Any) -> float:
 
 
 def without_noise(place: float, step: float) -> float:
-    """Return what a hand on a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
+    """Return what a user of a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
     near = float(f"{place:.12g}")
     return near if abs(near - place) <= min(step / 4, 64 * math.ulp(place)) else place
 

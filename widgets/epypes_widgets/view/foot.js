@@ -10,7 +10,7 @@ function tell(node, text, isGood = true) {
   node.classList.toggle("epypes-refused", !isGood);
 }
 
-const outcome = (name = "epypes-outcome") => element("span", `epypes-said ${name}`, { role: "status" });
+const outcome = (name = "epypes-outcome") => element("span", `epypes-message ${name}`, { role: "status" });
 const line = (status, ...asking) => element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, ...asking), status);
 
 function settingsLine(panel) {
@@ -18,7 +18,7 @@ function settingsLine(panel) {
   const name = element("input", "epypes-input epypes-setting", { type: "text", "aria-label": "Name of the settings", placeholder: "name of settings", list: list.id, spellcheck: "false" });
   const save = textButton("Save", () => onSetting("save"), "epypes-save", "Save the values as a TOML file");
   const load = textButton("Load", () => onSetting("load"), "epypes-load", "Load saved values");
-  const status = outcome("epypes-setting-said");
+  const status = outcome("epypes-setting-message");
 
   function onSetting(kind) {
     const asked = name.value.trim();

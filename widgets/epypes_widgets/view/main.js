@@ -74,7 +74,7 @@ function render({ model, el }) {
   };
   const failed = failures();
   let described = null;
-  let told = null;
+  let shownFailure = null;
   /** What the parts share. */
   const panel = {
     ...out,
@@ -137,8 +137,8 @@ function render({ model, el }) {
   }
 
   function tellFailure() {
-    if (failed.failure === told) return;
-    told = failed.failure;
+    if (failed.failure === shownFailure) return;
+    shownFailure = failed.failure;
     figure.classList.toggle("epypes-stale", failed.failure !== null);
     all("failure", failed.failure);
   }

@@ -3,7 +3,7 @@ import { element, note, say, shape, textButton } from "./elements.js";
 import { newestOnly } from "./protocol.js";
 
 const CURVE = { width: 600, height: 96, side: 8, above: 10, below: 10 };
-/** More can't be told apart. */
+/** More look like one line. */
 const MOST_DOTS = 500;
 const MOST_N = 10000;
 const LEAST_REACH = 20;
@@ -38,7 +38,7 @@ export function optimisePart(panel) {
   const start = textButton("Optimise", onStart, "epypes-search-start", "Search the values of all hyperparameters within their ranges");
   const stop = textButton("Stop", onStop, "epypes-search-stop", "Stop when the case that runs has ended");
   const use = textButton("Use best", () => panel.send({ kind: "optimise_use" }), "epypes-search-use", "Set the best values; undo goes back");
-  const status = element("span", "epypes-said epypes-search-said", { role: "status" });
+  const status = element("span", "epypes-message epypes-search-message", { role: "status" });
   const setting = element("div", "epypes-search-setting");
   const curve = shape("svg", { class: "epypes-search-curve", viewBox: `0 0 ${CURVE.width} ${CURVE.height}`, preserveAspectRatio: "none", role: "img" });
   const [high, low] = [element("span"), element("span")];

@@ -70,10 +70,10 @@ export function rowsPart(panel, figure) {
   async function bind(row) {
     const model = await panel.widgetModel(row.model);
     if (!model || closing.signal.aborted) return;
-    const told = () => moved(row, model.get("value"));
-    model.on("change:value", told);
-    closing.signal.addEventListener("abort", () => model.off("change:value", told));
-    told();
+    const update = () => moved(row, model.get("value"));
+    model.on("change:value", update);
+    closing.signal.addEventListener("abort", () => model.off("change:value", update));
+    update();
   }
 
   /** A slider has come to a place. */
@@ -188,9 +188,9 @@ export function rowsPart(panel, figure) {
 
   return {
     setup(message) {
-      const told = JSON.stringify([message.rows, message.folders]);
-      if (told !== given) {
-        given = told;
+      const next = JSON.stringify([message.rows, message.folders]);
+      if (next !== given) {
+        given = next;
         clear();
         ({ rows, folders } = message);
         for (const row of rows) row.names.forEach((name, index) => (panel.state.values[name] ??= row.value[index]));
