@@ -65,13 +65,13 @@ def test_a_search_that_can_not_be_begun_says_why(searched: Notebook) -> None:
     panel.page.locator(".epypes-search-start").click()
     said = panel.page.locator(".epypes-search-message")
     assert said.inner_text() == "! Give a number of trials from 1 to 10000."
-    searched.execute("k = panel.search._measure; panel.search._measure = 'no token'")
+    searched.execute("k = panel.search._metric; panel.search._metric = 'no token'")
     panel.page.locator(".epypes-trials").fill("5")
     panel.page.locator(".epypes-search-start").click()
     panel.wait(_STATE, "refused")
     assert "No token 'no token'" in said.inner_text()
     panel.page.locator(".epypes-search").scroll_into_view_if_needed()
-    searched.execute("panel.search._measure = k")
+    searched.execute("panel.search._metric = k")
 
 
 def test_a_search_is_stopped_while_the_panel_goes_on(searched: Notebook) -> None:

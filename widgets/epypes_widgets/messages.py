@@ -174,7 +174,7 @@ class Messages:
             self._promoted(Outcome("refused", text, to))
 
     def _start_write_back(self, message: Message) -> None:
-        if self._tuning.session.target.is_service:
+        if self._tuning.session.is_service:
             start_write_back(self._writing, self._write_back, dry_run=bool(message["dry_run"]))
         else:
             self._written(Outcome("refused", "Not written: a runner has no bundle to write to. Promote it."))

@@ -140,9 +140,12 @@ class Panel:
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""
-        first, target = self._runner.first_hyperparameters, self._session.target
-        name = code.name_of(target.owner, default=target.name)
-        return code.line(name, first, {**first, **self.values}, self._controls.params, verb=target.verb)
+        first, runner = self._runner.first_hyperparameters, self._runner
+        values = {**first, **self.values}
+        if isinstance(runner, CompGraphRunner):
+            return code.line(code.name_of(runner), first, values, self._controls.params)
+        name = code.name_of(runner.connection, default="service")
+        return code.line(name, first, values, self._controls.params, verb="set")
 
     # -- results ------------------------------------------------------------------------------------------------
 
@@ -273,8 +276,7 @@ class Panel:
         ServiceError
             The service is gone, refuses a value or the changed bundle.
         """
-        target = self._session.target
-        if not target.is_service:
+        if isinstance(self._runner, CompGraphRunner):
             raise TypeError("A runner has no bundle to write to. Promote it: ep.promote(runner, folder).")
         if self._session.is_wanting and not self._tuning.is_live:
             self._tuning.run()
@@ -282,9 +284,8 @@ class Panel:
         left = self._session.wanted
         if left:
             reason = self.error or "They wait for a control to be released."
-            raise ServiceError(target.owner.url, f"Not set in the service: {setting_text(left)}. {reason}")
-        written: WriteBack = target.owner.write_back(dry_run=dry_run)
-        return written
+            raise ServiceError(self._runner.connection.url, f"Not set in the service: {setting_text(left)}. {reason}")
+        return self._runner.connection.write_back(dry_run=dry_run)
 
     # -- itself -------------------------------------------------------------------------------------------------
 
@@ -356,7 +357,7 @@ class Panel:
                 if isinstance(param, Roi)
             ],
             "promote_to": proposal(self.token),
-            "writes_back": self._session.target.is_service,
+            "writes_back": self._session.is_service,
             "settings": list(settings.names(".")),
             "optimise": None if self.search is None else self.search.content(),
         }
@@ -459,9 +460,9 @@ def tune(
     found = read_cases(runner, images, cases)
     given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
     session = Session(runner, given)
-    if session.target.is_service and given:
+    if session.is_service and given:
         runner.trial({}, payload=given[0].values)  # refuses it
-    elif runner.last is None and not given and not session.target.is_service:
+    elif runner.last is None and not given and not session.is_service:
         free = runner.free_source_tokens
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)

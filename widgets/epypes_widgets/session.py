@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import is_, is_not
 from typing import Any
 
-from epypes.run import Run
+from epypes.run import CompGraphRunner, Run
 from epypes_widgets.images import Payload, is_alike
-from epypes_widgets.target import Target, Tunable
+from epypes_widgets.target import Tunable
 
 
 class Session:
@@ -32,12 +32,14 @@ class Session:
         The last run that completed; None before the first.
     image
         The index of the payload that it was computed from; None for one that is not among them.
-    target
-        Where its functions run.
+    is_service
+        Whether the functions run in a service: others may set hyperparameters too, whose changes are not to be
+        overwritten unseen, and values are written back.
     """
 
     def __init__(self, runner: Tunable, payloads: Sequence[Payload] = ()) -> None:
-        self.runner, self.payloads, self.target = runner, tuple(payloads), Target(runner)
+        self.runner, self.payloads = runner, tuple(payloads)
+        self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
         self.image = self._image_of(runner.last, is_alike)
         self._lock = threading.Lock()
@@ -80,6 +82,11 @@ class Session:
         run, free = self.result, self.runner.free_source_tokens
         return () if run is None else tuple(_value(run, token) for token in free)
 
+    @property
+    def notice(self) -> str:
+        """What is wrong with the place where the functions run; empty if nothing is."""
+        return "" if isinstance(self.runner, CompGraphRunner) else self.runner.notice
+
     def want(self, values: Mapping[str, Any]) -> None:
         """Ask for values of hyperparameters; they are newer than what a cell has set on the runner until now.
 
@@ -88,7 +95,7 @@ class Session:
         now = self.runner.hyperparameters
         with self._lock:
             self._wanted.update(values)
-            if not self.target.is_service:
+            if not self.is_service:
                 self._seen.update({name: now[name] for name in values if name in now})
 
     def want_image(self, index: int) -> None:
@@ -108,7 +115,8 @@ class Session:
         They count from then on: what was asked for these tokens before is dropped, and so is what was asked for a token
         that is no hyperparameter any more.
         """
-        self.target.catch_up()
+        if not isinstance(self.runner, CompGraphRunner):
+            self.runner.catch_up()
         now = dict(self.runner.hyperparameters)
         with self._lock:
             changed = {name: value for name, value in now.items() if self._seen.get(name, self) is not value}
@@ -151,12 +159,18 @@ class Session:
         """Set what is wanted on a runner that is changed all the time; its next run has it."""
         with self._lock:
             wanted, self._wanted = self._wanted, {}
-        self.target.put(wanted)
+        if isinstance(self.runner, CompGraphRunner):
+            self.runner.set(**wanted)
+        else:
+            self.runner.put(wanted)
 
     def compared(self, values: Mapping[str, Any], token: str) -> Run:
         """Return a run with these hyperparameters, on the present payload; LookupError if it can't be had."""
         known = self.runner.hyperparameters
-        return self.target.compared({name: value for name, value in values.items() if name in known}, token)
+        values = {name: value for name, value in values.items() if name in known}
+        if isinstance(self.runner, CompGraphRunner):
+            return self.runner.trial(values, token)
+        return self.runner.remembered(values, token)
 
     def _image_of(self, run: Run | None, is_one: Callable[[Any, Any], bool] = is_) -> int | None:
         """Return the index of the payload that a run was computed from."""

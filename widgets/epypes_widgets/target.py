@@ -7,10 +7,9 @@ was found is written back into its bundle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from epypes.run import CompGraphRunner, Run
+from epypes.run import CompGraphRunner
 
 if TYPE_CHECKING:
     from epypes.service.remote.runner import RemoteRunner
@@ -34,46 +33,3 @@ def tunable(given: object) -> Tunable:
         )
     tuned: Tunable = found
     return tuned
-
-
-class Target:
-    """What a panel does otherwise for a runner of this process and for a service.
-
-    Attributes
-    ----------
-    owner
-        The object that the line of code calls: the runner, or the connection.
-    name, verb
-        What that is called if it has no name, and its method that sets hyperparameters.
-    is_service
-        Whether others may set hyperparameters too, whose changes are not to be overwritten unseen, and values are
-        written back.
-    """
-
-    def __init__(self, runner: Any) -> None:
-        self._runner = runner
-        self.is_service = not isinstance(runner, CompGraphRunner)
-        self.owner = runner.connection if self.is_service else runner
-        self.name, self.verb = ("service", "set") if self.is_service else ("runner", "rerun")
-
-    def compared(self, values: Mapping[str, Any], *targets: str) -> Run:
-        """Return a run to compare with, with these hyperparameters and tokens; LookupError if there is none."""
-        run: Run = (self._runner.remembered if self.is_service else self._runner.trial)(values, *targets)
-        return run
-
-    def put(self, values: Mapping[str, Any]) -> None:
-        """Set hyperparameters, whatever runs."""
-        if self.is_service:
-            self._runner.put(values)
-        else:
-            self._runner.set(**values)
-
-    def catch_up(self) -> None:
-        """Take over what others have changed, before the hyperparameters are read."""
-        if self.is_service:
-            self._runner.catch_up()
-
-    @property
-    def notice(self) -> str:
-        """What is wrong with the place where the functions run; empty if nothing is."""
-        return str(self._runner.notice) if self.is_service else ""

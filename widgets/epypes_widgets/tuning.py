@@ -161,7 +161,7 @@ class Tuning:
 
     def leave(self) -> None:
         """Take note that no view is left: a service without one is not listened to."""
-        if self.session.target.is_service:
+        if self.session.is_service:
             self._unwatch()
 
     def come_back(self) -> None:
@@ -269,13 +269,12 @@ class Tuning:
 
     def _refuse(self, error: Exception) -> None:
         """Say why there is no run."""
-        target = self.session.target
-        if isinstance(error, NotComputed) and target.is_service:
+        if isinstance(error, NotComputed) and self.session.is_service:
             if self.session.result is not None:
                 self.screen.show(self.session.result, 0)
             self.screen.note(str(error), waits=True)
         else:
-            self._is_unwell = bool(target.notice)
+            self._is_unwell = bool(self.session.notice)
             self.screen.fail(str(error), names=tuple(getattr(error, "problems", ())))
 
     def _waits_for_screen(self) -> bool:
@@ -287,7 +286,7 @@ class Tuning:
 
     def _show_notice(self) -> None:
         """Say what is wrong with the place where the functions run: the picture may not be the newest."""
-        notice = self.session.target.notice
+        notice = self.session.notice
         self._is_unwell = bool(notice)
         if notice and notice != self.screen.error:
             self.screen.fail(notice)
@@ -297,7 +296,7 @@ class Tuning:
         wanted = self.session.wanted
         changed = self.session.changes_of_others()
         if changed:
-            if self.session.target.is_service:
+            if self.session.is_service:
                 self._show_conflict(wanted, changed)
             self._log(self.controls.follow(changed))
             self._commit_later(REST_S)
