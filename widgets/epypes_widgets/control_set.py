@@ -13,7 +13,6 @@ from epypes.errors import UnknownName
 from epypes.hints import Param
 from epypes_widgets.controls import Control
 from epypes_widgets.ranges import Range
-from epypes_widgets.values import differing
 
 
 class ControlSet:
@@ -83,21 +82,16 @@ class ControlSet:
         """
         parts = self._parts(values)
         with self._lock:
-            held = {} if by_user else {control: own for control, own in parts.items() if self._is_held(control)}
-            for control, own in held.items():
+            for control, own in parts.items():
                 control.check(own)
-            before = {control: control.read() for control in parts if control not in held}
-            try:
-                for control in before:
-                    control.write(parts[control])
-            except ValueError:
-                for control, own in before.items():
-                    if differing(own, control.read()):
-                        control.write(own)
-                raise
-            for own in held.values():
-                self._waiting.update(own)
-            return {name: control.read()[name] for control in before for name in parts[control]}
+            moved: dict[str, Any] = {}
+            for control, own in parts.items():
+                if self._is_held(control) and not by_user:
+                    self._waiting.update(own)
+                    continue
+                control.write(own)
+                moved |= {name: control.read()[name] for name in own}
+            return moved
 
     def slide(self, places: Mapping[str, Any]) -> None:
         """Move sliders that are being dragged, by the id of their model, as if the front end had set their value."""
