@@ -14,7 +14,7 @@ from skimage import data
 from xdist.scheduler import LoadFileScheduling
 
 import epypes as ep
-from epypes.bundle import replay
+from epypes.bundle import replay_process
 from epypes.cli import main
 from tests import hangs
 from tests.brokers.fixtures import broker, certificates, mosquitto, nats, rabbitmq
@@ -119,7 +119,7 @@ def warm_replays():
     """Replays are forks of a process that has NumPy and EPypes loaded, but for those of `fresh_interpreter`."""
     processes = WarmProcesses()
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(replay, "subprocess", processes)
+        patched.setattr(replay_process, "subprocess", processes)
         yield processes
     processes.close()
 

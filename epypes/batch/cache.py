@@ -1,8 +1,10 @@
-"""The cache of results: what a stored outcome is keyed by, and which outcomes need not be computed again.
+"""The cache of results: what a stored result is keyed by, and which results need not be computed again.
 
 A series in a store is of one graph and of the hyperparameters that don't vary. Its name is the one that the user gives,
 or the digest of both. An outcome's key is the item's name and content, the values that vary, the tokens that are shown,
 and the state of the lists, arrays and objects that functions use. What can't be digested is never taken from the store.
+The trials of a search are those of a study, whose name is given or digested too; it has no keys. No other module
+decides what a result of a map, a sweep or a search is stored under.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from time import monotonic
 from typing import Any, Final
 from warnings import warn
 
+from epypes.batch.cases import Case
 from epypes.batch.items import Item
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
@@ -152,21 +155,32 @@ def _is_short(value: Any) -> bool:
 # -- searches -------------------------------------------------------------------------------------------------------
 
 
-def search_digests(
-    cg: CompGraph, metric: Any, data: Mapping[str, Callable[[], Any]], *, is_named: bool
-) -> dict[str, str]:
-    """Return digests of all that decides about the trials of a search, by what they are of.
+class SearchKey:
+    """What the trials of a search are stored under: the name of their study, and what the study searches.
 
     Parameters
     ----------
-    cg
-        The graph.
+    title
+        What a name that is computed begins with.
+    name
+        The name that the user gives; "" computes one.
+    runner
+        Its graph and the hyperparameters that do not vary are compared.
     metric
-        The function that measures it; the name of a token is no part of this.
-    data
-        By what it is, what returns anything else that decides about trials.
-    is_named
-        Whether the user has given the search a name; what has no digest has "" then.
+        The function that measures a run, or the name of a token.
+    choices
+        By token of what varies, the values; None of a range.
+    items, cases
+        The inputs, and the cases with their labels.
+    readable
+        What else decides about trials, such as ranges: texts by what they are of.
+
+    Attributes
+    ----------
+    name
+        The name of the study.
+    about
+        By what they are of, the readable texts, and digests; "" where there is none.
 
     Raises
     ------
@@ -174,17 +188,55 @@ def search_digests(
         Something has no digest, and the search no name.
     """
 
-    def of_graph() -> str:
-        found = graph_fingerprint(cg)
-        if found.unknown or found.reader:
-            raise NoDigest(found.unknown or reader_text(found.reader))
-        return combined_digest("graph", found.code, found.state).hex()
+    def __init__(
+        self,
+        title: str,
+        name: str,
+        runner: CompGraphRunner,
+        metric: Any,
+        choices: Mapping[str, Any],
+        items: Sequence[Item],
+        cases: Sequence[Case],
+        readable: Mapping[str, str],
+    ) -> None:
+        fixed = {token: value for token, value in runner.hyperparameters.items() if token not in choices}
+        labels = [(case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in cases]
+        self._readable = readable
+        self._code: dict[str, Callable[[], str]] = {
+            "graph": lambda: _graph_digest(runner.cg),
+            "metric": lambda: "token" if isinstance(metric, str) else function_digest(metric),
+        }
+        data: dict[str, Callable[[], str]] = {
+            "hyperparameters": lambda: value_digest((fixed, choices)),
+            "inputs of the cases": lambda: value_digest([(item.name, payload_digest(item.payload)) for item in items]),
+            "labels of the cases": lambda: value_digest(labels),
+        }
+        self.about = {**readable, **_digests({**self._code, **data}, is_named=bool(name))}
+        self.name = name or f"{title} {combined_digest('search', repr(sorted(self.about.items()))).hex()[:12]}"
 
-    ways: dict[str, Callable[[], str]] = {
-        "graph": of_graph,
-        "metric": lambda: "token" if isinstance(metric, str) else function_digest(metric),
-        **{what: lambda given=given: value_digest(given()) for what, given in data.items()},  # type: ignore[misc]
-    }
+    def difference(self, before: Mapping[str, str]) -> str:
+        """Return how a study differs from this search by what it is about; "" if it is the same search."""
+        found = []
+        for what, now in self.about.items():
+            was = before.get(what, "unknown")
+            if now and was and now != was:
+                found.append(f"{what}: {was:.200}" if what in self._readable else f"other {what}")
+        return ", ".join(found)
+
+    def changed(self) -> list[str]:
+        """Return what has another digest by now, as a function that notes its calls in a list."""
+        return [what for what, digest in _digests(self._code, is_named=True).items() if digest != self.about[what]]
+
+
+def _graph_digest(cg: CompGraph) -> str:
+    found = graph_fingerprint(cg)
+    if found.unknown or found.reader:
+        raise NoDigest(found.unknown or reader_text(found.reader))
+    return combined_digest("graph", found.code, found.state).hex()
+
+
+def _digests(ways: Mapping[str, Callable[[], str]], *, is_named: bool) -> dict[str, str]:
+    """Return digests by what they are of; what has none has "" in a search with a name."""
     digests = {}
     for what, way in ways.items():
         try:

@@ -44,7 +44,7 @@ from typing import Any, Final
 
 from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, read_value
 from epypes.batch.metrics import METRICS
-from epypes.bundle.settings import read
+from epypes.bundle.settings import decode_value
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.wording import ended
@@ -461,7 +461,7 @@ def _hyperparameter(token: str, entry: Any) -> Any:
     if not isinstance(entry, Mapping):
         return entry
     try:
-        return read(entry)
+        return decode_value(entry)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise ValueError(
             f"Hyperparameter {token!r} can't be read: {ended(str(error))} Write it as in pipeline.toml, such as "

@@ -23,12 +23,10 @@ from concurrent.futures import (
 from dataclasses import replace
 from typing import Any, Final
 
-from epypes.batch.items import payload_of
 from epypes.batch.job import Job, failed_outcomes, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
     PackagedJob,
-    known_package,
     package_of,
     packed_job,
     packed_values,
@@ -247,16 +245,10 @@ class _Threads:
 
     def _run(self, job: Job) -> list[Outcome]:
         outcomes: list[Outcome] = []
-        if not self._is_stopped:
-            for outcome in run_job(branched(self._runner), job):
-                outcomes.append(outcome)
-                if self._is_stopped:
-                    break
+        waiting = run_job(branched(self._runner), job)
+        while not any(stop.is_set() for stop in self._stops) and (outcome := next(waiting, None)) is not None:
+            outcomes.append(outcome)
         return outcomes
-
-    @property
-    def _is_stopped(self) -> bool:
-        return any(stop.is_set() for stop in self._stops)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""
@@ -284,7 +276,7 @@ class _Processes:
 
     def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
         """Send a job to a worker process."""
-        package = self._package = self._package or known_package(self._runner) or self._proven(job)
+        package = self._package = self._package or package_of(self._runner, job.item)
         if package is None:
             here: Future[Any] = Future()
             here.set_result(list(run_job(clone_runner(self._runner), job)))
@@ -295,15 +287,6 @@ class _Processes:
         options = tuple((name, getattr(runner, name)) for name in ("workers", "guard", "check_mutation"))
         packaged = PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed_job(job), options)
         return _submitted(self._executor, run_packaged_job, packaged)
-
-    def _proven(self, job: Job) -> PackagedGraph | None:
-        """Return the package that a run of the job's item proves; None if it can't be run."""
-        own = clone_runner(self._runner)
-        try:
-            own.run_on(payload_of(job.item, own.cg))
-        except (Exception, SystemExit):  # whatever a function raises: it will be that item's failure
-            return None
-        return package_of(own)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job that came back."""

@@ -71,6 +71,10 @@ class NumberAxis:
             return 0
         return math.floor((_written(self.high) - _written(self.low)) / _written(self.step) + _SLACK) + 1
 
+    def __str__(self) -> str:
+        options = {"step": self.step, "log": self.log or None, "below": self.below or None}
+        return f"{self.low} to {self.high}" + "".join(f" {name} {given}" for name, given in options.items() if given)
+
     def values(self) -> Sequence[Any]:
         """Return all values; if they are too many to hold, only a range of that length.
 
@@ -140,6 +144,9 @@ class ChoiceAxis:
     token: str
     choices: tuple[Any, ...]
     labels: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return " or ".join(self.labels)
 
     def at(self, share: float) -> Any:
         """Return the value at a share from 0 to below 1."""
@@ -352,7 +359,7 @@ def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
 # -- grids --------------------------------------------------------------------------------------------------------
 
 
-def require_room(size: int, names: Iterable[str], images: int) -> None:
+def require_room(size: int, names: Iterable[str], images: int = 1) -> None:
     """Raise ScaleError if the outcomes of so many settings, each on so many images, are too many to hold."""
     if size * images > MOST_OUTCOMES:
         each = f" on {images:,} images" if images != 1 else ""
@@ -363,14 +370,14 @@ def require_room(size: int, names: Iterable[str], images: int) -> None:
 
 
 def settings_of(
-    runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0, images: int = 1
+    runner: CompGraphRunner, grid: Any, *, how: str = "product", n: int | None = None, seed: int = 0
 ) -> tuple[Setting, ...]:
     """Return the settings of a grid, each with a value for every hyperparameter that varies; see ``sweep``.
 
     Raises
     ------
     ScaleError
-        It does not tell which settings are meant, is empty, or has too many settings for so many images.
+        It does not tell which settings are meant, is empty, or has too many settings to hold.
     UnknownName, HyperparameterError
         A name is not a hyperparameter of the runner, or a value none that the runner can have.
     """
@@ -384,34 +391,33 @@ def settings_of(
             f"n={n!r} goes with how='random' or how='latin'. A {how} has as many settings as its values make."
         )
     if _is_list_of(grid, Mapping):
-        return _listed(runner, grid, images)
+        return _listed(runner, grid)
     given = dict.fromkeys(grid) if _is_list_of(grid, str) else grid
     if not isinstance(given, Mapping) or not given:
         raise ScaleError(
             f"grid is a mapping of hyperparameters to values, as {{'threshold': [50, 70]}}, not {grid!r:.60}."
         )
     if is_drawn:
-        require_room(n or 0, given, images)
+        require_room(n or 0, given)
         return _drawn(runner, given, how, n or 0, seed)
-    return _combined(runner, given, how, images)
+    return _combined(runner, given, how)
 
 
 def _is_list_of(grid: Any, kind: type) -> bool:
     return isinstance(grid, list | tuple) and bool(grid) and all(isinstance(one, kind) for one in grid)
 
 
-def _listed(runner: CompGraphRunner, grid: Sequence[Setting], images: int) -> tuple[Setting, ...]:
+def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> tuple[Setting, ...]:
     """Return settings that are taken as they are; what one leaves out is the runner's."""
     names = tuple(dict.fromkeys(name for setting in grid for name in setting))
     if not names:
         raise ScaleError("No setting of the grid names a hyperparameter. Give some, as [{'threshold': 50}, ...].")
     _require_settable(runner, grid)
-    require_room(len(grid), names, images)
     now = {name: runner.hyperparameters[name] for name in names}
     return tuple({**now, **setting} for setting in grid)
 
 
-def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str, images: int) -> tuple[Setting, ...]:
+def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> tuple[Setting, ...]:
     """Return the settings of each value with each other, or of the first values of all, the second ones, and so on."""
     values: dict[str, Sequence[Any]] = {}
     for name, of_name in given.items():
@@ -430,7 +436,7 @@ def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str, image
             f"how='zip' takes the first values together, then the second, and so on, but {counts}. "
             "Give as many of each."
         )
-    require_room(max(lengths.values()) if how == "zip" else math.prod(lengths.values()), values, images)
+    require_room(max(lengths.values()) if how == "zip" else math.prod(lengths.values()), values)
     combine: Callable[..., Iterable[tuple[Any, ...]]] = zip if how == "zip" else product
     return tuple(dict(zip(values, row, strict=True)) for row in combine(*values.values()))
 

@@ -281,9 +281,7 @@ def sweep(
     """
     if images is None:
         images = [Item(0, "last payload", _last_payload(runner))]
-    count = count_of(images) or 1
-    settings = settings_of(runner, grid, how=how, n=n, seed=seed, images=count)
-    _require_room_for_pictures(runner, settings, show, count)
+    settings = settings_of(runner, grid, how=how, n=n, seed=seed)
     outcomes = run_items(
         runner, images, settings, executor,
         kind="sweep", keep=keep, show=show, store=store, name=name, progress=progress,
@@ -291,12 +289,13 @@ def sweep(
     return SweepResult(outcomes, tuple(settings[0]), runner)
 
 
-def _require_room_for_pictures(
-    runner: CompGraphRunner, settings: Sequence[Setting], show: Sequence[str] | None, images: int
+def _require_room(
+    runner: CompGraphRunner, settings: Sequence[Setting], shown: Sequence[str] | None, images: int
 ) -> None:
-    after = functions_after(runner.cg, *settings[0])
-    varying = {token for function in after for token in runner.cg.func_outputs(function)}
-    tokens = varying if show is None else varying.intersection(tokens_of(runner, show))
+    """Raise ScaleError if the outcomes of a sweep, or the pictures of tokens that vary, are too many to hold."""
+    require_room(len(settings), settings[0], images)
+    varying = {token for name in functions_after(runner.cg, *settings[0]) for token in runner.cg.func_outputs(name)}
+    tokens = varying if shown is None else varying.intersection(shown)
     pictures = len(settings) * images * len(tokens)
     if pictures > _MOST_PICTURES:
         raise ScaleError(
@@ -342,6 +341,8 @@ def run_items(
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
     count = count_of(images)
+    if kind == "sweep":
+        _require_room(runner, settings, shown, count or 1)
     outcomes: list[Outcome] = []
     with (
         outcome_cache(store, kind, runner, name, keep=kept, show=shown, settings=in_order) as cache,
@@ -357,7 +358,7 @@ def run_items(
             for item in items_of(images, runner):
                 # How many a generator gives is known when it gives them; a map may be of any number.
                 if kind == "sweep":
-                    require_room(len(settings), settings[0], item.number + 1)
+                    _require_room(runner, settings, shown, item.number + 1)
                 missing = in_order
                 if cache is not None:
                     stored = cache.found(item)

@@ -19,18 +19,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
-from epypes.batch.cache import payload_digest, search_digests
+from epypes.batch.cache import SearchKey
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
-from epypes.batch.grid import Axis, axes_of, bounded
+from epypes.batch.grid import Axis, ChoiceAxis, axes_of, bounded
 from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
-from epypes.bundle.fingerprint import combined_digest
-from epypes.display.durations import duration_text
 from epypes.display.markup import content, cut, cut_name, escape
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
@@ -55,7 +53,7 @@ _REASON_CHARACTERS: Final = 300
 # The attributes of trials and studies in Optuna's tables.
 _FAILURE: Final = "failure"
 _NANOSECONDS: Final = "total_ns"
-_DIGESTS: Final = "about"
+_ABOUT: Final = "about"
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +205,15 @@ class OptimizeResult:
             evaluator = PedAnovaImportanceEvaluator()
             return _figure(lambda: plot_param_importances(self.study, evaluator, target_name=self.metric))
 
-    def __repr__(self) -> str:
-        best = best_of(self.trials, self.direction)
+    @property
+    def _caption(self) -> str:
+        best, failed = best_of(self.trials, self.direction), len(self.failures)
         found = "none completed" if best is None else f"best {self.metric:.30} {best.value:.6g}"
-        stopped = ", stopped" * self.was_stopped
-        return f"<OptimizeResult: {counted(len(self.trials), 'trial')}{stopped}; {found}>"
+        state = f"{f', {failed} failed' if failed else ''}{', stopped' * self.was_stopped}"
+        return f"{counted(len(self.trials), 'trial')}{state}; {found}"
+
+    def __repr__(self) -> str:
+        return f"<OptimizeResult: {self._caption}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         return {"text/plain": repr(self), "text/html": _page(self)}
@@ -326,17 +328,10 @@ def optimize(
     objective = _Objective(runner, metric, _cases(cases, runner), keep)
     at_once = 1 if executor is None else worker_count(executor)
     with opened_store(store) as opened:
-        digests, study = dict[str, str](), name or ""
-        if opened is not None:
-            data = _searched_data(axes, objective)
-            digests = search_digests(runner.cg, metric, data, is_named=bool(name))
-            text = repr((direction, axes, sorted(digests.items())))
-            study = name or f"optimize {objective.name} {combined_digest('search', text).hex()[:12]}"
-        search = _Search(axes, runner.hyperparameters, direction, seed, at_once, opened, study, digests)
-        with contextlib.closing(search):
+        key = None if opened is None else _key(objective, axes, direction, name)
+        with contextlib.closing(_Search(axes, runner.hyperparameters, direction, seed, at_once, opened, key)) as search:
             was_stopped = _searched(search, objective, executor, stop or threading.Event(), n, on_trial, progress)
-            if opened is not None:
-                search.forget_changed(search_digests(runner.cg, metric, {}, is_named=True))
+            search.forget_changed()
     result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
     if result.trials and not was_stopped and len(result.failures) == len(result):
         first = result.trials[0]
@@ -345,18 +340,17 @@ def optimize(
     return result
 
 
-def _searched_data(axes: Sequence[Axis], objective: _Objective) -> dict[str, Callable[[], Any]]:
-    """Return the data that decide about a trial, by what they are, for their digests."""
-    choices = {axis.token: getattr(axis, "choices", None) for axis in axes}
-    fixed = {token: value for token, value in objective.runner.hyperparameters.items() if token not in choices}
-    return {
-        "hyperparameters": lambda: (fixed, choices),
-        "inputs of the cases": lambda: [(item.name, payload_digest(item.payload)) for item in objective.items],
-        "labels of the cases": lambda: [
-            (case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases
-        ],
-        "tokens that are measured": lambda: objective.keep,
+def _key(objective: _Objective, axes: Sequence[Axis], direction: str, name: str | None) -> SearchKey:
+    readable = {
+        "ranges": ", ".join(f"{axis.token} in {axis}" for axis in axes),
+        "direction": direction,
+        "tokens": ", ".join(objective.keep),
     }
+    choices = {axis.token: axis.choices if isinstance(axis, ChoiceAxis) else None for axis in axes}
+    return SearchKey(
+        f"optimize {objective.name}", name or "", objective.runner, objective.metric, choices,
+        objective.items, objective.cases, readable,
+    )  # fmt: skip
 
 
 def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
@@ -464,7 +458,7 @@ class _Objective:
         self.runner, self.cases = runner, tuple(cases)
         items = items_of([case.inputs for case in cases], runner)
         self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
-        self._metric = metric
+        self.metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         kept = runner.cg.sink_tokens if keep is None else keep
         self.keep = tokens_of(runner, metric if isinstance(metric, str) else kept)
@@ -489,7 +483,7 @@ class _Objective:
         """Return the metric of one case, and the reason if there is none."""
         if outcome.error_info is not None:
             return math.nan, str(outcome.error_info)
-        tokens, metric = MappingProxyType(dict(outcome.kept)), self._metric
+        tokens, metric = MappingProxyType(dict(outcome.kept)), self.metric
         try:
             given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
         except (Exception, SystemExit) as error:
@@ -516,12 +510,8 @@ class _Search:
         Of the sampler: the same one suggests the same again, if one trial is run at a time.
     at_once
         How many trials are run at a time; with several, those that still run count as bad ones.
-    store
-        The database that keeps the trials; None for none.
-    name
-        Of the study in there. If it is there, it goes on.
-    digests
-        What is searched: digests by what they are of, "" where there is none. They are stored with the study.
+    store, key
+        The database that keeps the trials, and the key of the study in there, which goes on; None for none.
 
     Raises
     ------
@@ -537,22 +527,21 @@ class _Search:
         seed: int,
         at_once: int,
         store: Store | None,
-        name: str,
-        digests: Mapping[str, str],
+        key: SearchKey | None,
     ) -> None:
         with optional_import():
             import optuna
         self._axes, self._direction = axes, direction
-        self._present, self._digests = present, digests
+        self._present, self._key = present, key
         self._distributions = {axis.token: axis.distribution for axis in axes}
         self._storage: optuna.storages.RDBStorage | None = None
         self._stored: optuna.Study | None = None
         with quiet_optuna():
-            before = [] if store is None else self._open(store, name)
+            before = [] if store is None or key is None else self._open(store, key)
             # A search that goes on has another seed: the same numbers again would be the same trials again.
             sampler = optuna.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
             self.study: optuna.Study = optuna.create_study(
-                sampler=sampler, study_name=name or None, direction=direction
+                sampler=sampler, study_name=key.name if key else None, direction=direction
             )
         if before:
             self.study.add_trials(before)
@@ -586,11 +575,11 @@ class _Search:
             self._stored.add_trial(frozen)
         return self._trial(frozen)
 
-    def forget_changed(self, digests: Mapping[str, str]) -> None:
-        """Blank the stored digests that are others by now, as of a function that notes its calls in a list."""
-        changed = {what: "" for what, digest in digests.items() if digest != self._digests[what]}
-        if changed and self._stored is not None:
-            self._stored.set_user_attr(_DIGESTS, {**self._digests, **changed})
+    def forget_changed(self) -> None:
+        """Blank the stored digests of what has changed meanwhile, as a function that notes its calls in a list."""
+        if self._stored is not None and self._key is not None:
+            about = self._stored.user_attrs[_ABOUT]
+            self._stored.set_user_attr(_ABOUT, {**about, **dict.fromkeys(self._key.changed(), "")})
 
     def close(self) -> None:
         """Close the database. May be called twice."""
@@ -604,7 +593,7 @@ class _Search:
         failure = noted.get(_FAILURE, "") or ("" if frozen.value is not None else "no reason is stored")
         return Trial(frozen.number, self.setting(frozen.params), frozen.value, failure, noted.get(_NANOSECONDS, 0))
 
-    def _open(self, store: Store, name: str) -> list[optuna.trial.FrozenTrial]:
+    def _open(self, store: Store, key: SearchKey) -> list[optuna.trial.FrozenTrial]:
         """Open the study in the database and return the trials that have ended, if it searches the same."""
         import optuna
         import sqlalchemy.exc
@@ -617,7 +606,7 @@ class _Search:
             options = {"connect_args": connect_options(store.url)}
             self._storage = optuna.storages.RDBStorage(given, engine_kwargs=options)
             stored = optuna.create_study(
-                storage=self._storage, study_name=name, direction=self._direction, load_if_exists=True
+                storage=self._storage, study_name=key.name, direction=self._direction, load_if_exists=True
             )
         except refusals as error:
             self.close()
@@ -625,40 +614,20 @@ class _Search:
             raise ScaleError(f"{text} Give another store=, or none.") from error
         found = _finished(stored)
         # A study without trials is of nothing yet.
-        difference = self._difference(stored, found) if found else ""
+        before: Mapping[str, str] = stored.user_attrs.get(_ABOUT, {}) if found else key.about
+        difference = key.difference(before)
         if difference:
             self.close()
-            text = f"There is a study {name!r} in this store, and it searches something else ({difference})."
+            text = f"There is a study {key.name!r} in this store, and it searches something else ({difference})."
             raise ScaleError(f"{text} Give another name=, or search the same.")
         # A digest that is blank once stays blank.
-        before = stored.user_attrs.get(_DIGESTS, {}) if found else {}
-        self._digests = {what: digest and before.get(what, digest) for what, digest in self._digests.items()}
-        stored.set_user_attr(_DIGESTS, self._digests)
+        stored.set_user_attr(_ABOUT, {what: text and before[what] for what, text in key.about.items()})
         self._stored = stored
         return found
-
-    def _difference(self, stored: optuna.Study, found: Sequence[optuna.trial.FrozenTrial]) -> str:
-        """Return what a study in a database searches that this search does not; empty if it is the same search."""
-        others = next((trial.distributions for trial in found if trial.distributions != self._distributions), None)
-        if others is not None:
-            return f"{', '.join(f'{token} in {_range_text(other)}' for token, other in others.items()):.200}"
-        before = stored.user_attrs.get(_DIGESTS, {})
-        changed = [
-            what for what, digest in self._digests.items() if digest and before.get(what) and digest != before[what]
-        ]
-        if changed:
-            return f"other {' and '.join(changed)}"
-        direction = stored.direction.name.lower()
-        return f"to {direction}" if direction != self._direction else ""
 
 
 def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     return [trial for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
-
-
-def _range_text(distribution: Any) -> str:
-    choices = getattr(distribution, "choices", None)
-    return ", ".join(map(str, choices)) if choices else f"{distribution.low:g} to {distribution.high:g}"
 
 
 # -- figures and page -------------------------------------------------------------------------------------------
@@ -680,7 +649,7 @@ _MOST_REASONS: Final = 3
 
 def _page(result: OptimizeResult) -> str:
     best = best_of(result.trials, result.direction)
-    parts = [f"<p>{content(_sentence(result))}</p>"]
+    parts = [f"<p>{content(result._caption)}</p>"]
     if best is not None:
         parts += [_curve(result), _table(result, best)]
     reasons = list(dict.fromkeys(trial.failure for trial in result.failures))
@@ -718,18 +687,6 @@ def _table(result: OptimizeResult, best: Trial) -> str:
     values = (result.metric, f"{best.value:.6g}", "failed" if first.value is None else f"{first.value:.6g}", "")
     head = ("hyperparameter", f"best (trial {best.number})", "first trial", "importance")
     return html_table("", head, [values, *rows])
-
-
-def _sentence(result: OptimizeResult) -> str:
-    best = best_of(result.trials, result.direction)
-    spent_ns = sum(trial.total_ns for trial in result.trials)
-    failed = f", {len(result.failures)} failed" if result.failures else ""
-    stopped = ", stopped before its end" * result.was_stopped
-    trials = f"{counted(len(result.trials), 'trial')}{failed}{stopped}, {duration_text(spent_ns)} of functions."
-    if best is None:
-        return f"{trials} None has completed."
-    what = f"To {result.direction} {cut_name(result.metric, 40)}"
-    return f"{trials} {what}: {best.value:.6g} is the best, of trial {best.number}."
 
 
 @contextlib.contextmanager

@@ -13,18 +13,20 @@ import re
 import socket
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
 from epypes.batch.cache import graph_fingerprint
+from epypes.batch.items import Item, payload_of
 from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
-from epypes.bundle.fingerprint import combined_digest
-from epypes.bundle.load import SAMPLES, Bundle, read_bundle
-from epypes.bundle.settings import Unwritable, members_in, read, written
+from epypes.bundle.clone import clone_runner
+from epypes.bundle.load import Bundle, read_bundle
+from epypes.bundle.manifest import REQUIREMENTS, SAMPLES
+from epypes.bundle.settings import Unwritable, decode_value, encode_value, members_in
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.branch import branched
@@ -51,7 +53,7 @@ class PackagedGraph:
     Attributes
     ----------
     digest
-        Of its files; a worker process knows by it what it has unpacked.
+        The bundle's; a worker process knows by it what it has unpacked.
     files
         Their contents by path, without samples; None where they are left out.
     """
@@ -61,26 +63,30 @@ class PackagedGraph:
 
 
 # The packages that this process has made, by what they compute; the oldest ones go.
-_PACKAGES: Final[dict[tuple[str, ...], PackagedGraph]] = {}
+_PACKAGES: Final[dict[tuple[str, ...] | None, PackagedGraph]] = {}
 
 
-def known_package(runner: CompGraphRunner) -> PackagedGraph | None:
-    """Return the package of a runner's graph if this process has made it before."""
-    key = _key_of(runner)
-    return None if key is None else _PACKAGES.get(key)
+def package_of(runner: CompGraphRunner, item: Item) -> PackagedGraph | None:
+    """Return the package of a runner's graph, once made in this process; None if the item can't be run.
 
-
-def package_of(runner: CompGraphRunner) -> PackagedGraph:
-    """Package a runner's graph; its last run is the sample that proves the bundle.
+    A run of the item is the sample that proves the bundle.
 
     Raises
     ------
     PromotionRefused
         With every reason why the graph can't become a bundle.
     """
+    key = _key_of(runner)
+    if key in _PACKAGES:
+        return _PACKAGES[key]
+    own = clone_runner(runner)
+    try:
+        own.run_on(payload_of(item, own.cg))
+    except (Exception, SystemExit):  # whatever a function raises: it will be that item's failure
+        return None
     with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
         try:
-            bundle = promote(runner, Path(folder) / _NAME)
+            bundle = promote(own, Path(folder) / _NAME)
         except PromotionRefused as error:
             refused = PromotionRefused(_BUNDLE, _reasons(error.reasons, Path(folder) / _NAME))
             refused.add_note(_NOTE)
@@ -90,9 +96,8 @@ def package_of(runner: CompGraphRunner) -> PackagedGraph:
             raise
         paths = sorted(file for file in bundle.path.rglob("*") if file.is_file() and SAMPLES not in file.parts)
         files = {str(file.relative_to(bundle.path)): file.read_bytes() for file in paths}
-    digest = combined_digest(*(part for file in files.items() for part in file)).hex()
-    package = PackagedGraph(digest, files)
-    if (key := _key_of(runner)) is not None:
+    package = PackagedGraph(bundle.digest, files)
+    if key is not None:
         _PACKAGES[key] = package
         _drop_oldest(_PACKAGES, _MOST_PACKAGES)
     return package
@@ -158,7 +163,7 @@ def packed(value: Any, what: str) -> Any:
         return value
     try:
         if any(members_in(value)):
-            return TomlValue(written(value))
+            return TomlValue(encode_value(value))
         return WireValue(tuple(bytes(frame) for frame in encode(Envelope(_PART, {_PART: value}))))
     except (MessageError, Unwritable) as error:
         way_out = "Use a ThreadPoolExecutor, or none, where values stay in this process."
@@ -169,7 +174,7 @@ def unpacked(value: Any, enums: Mapping[str, Any] | None = None) -> Any:
     """Return the value that ``packed`` packed."""
     if isinstance(value, WireValue):
         return decode(value.frames).parts[_PART]
-    return read(value.written, enums) if isinstance(value, TomlValue) else value
+    return decode_value(value.written, enums) if isinstance(value, TomlValue) else value
 
 
 def packed_values(values: Mapping[str, Any], what: str) -> dict[str, Any]:
@@ -184,20 +189,17 @@ def unpacked_values(values: Mapping[str, Any], enums: Mapping[str, Any] | None =
 
 def packed_job(job: Job) -> Job:
     """Return a job as it travels: without where it starts, since that has a lock and a runner of this process."""
-    item = replace(job.item, payload=packed_values(job.item.payload, "Input"))
-    settings = tuple(packed_values(setting, "Hyperparameter") for setting in job.settings)
-    return replace(job, item=item, settings=settings, start=None)
+    return replace(_with_values(job, packed_values), start=None)
 
 
 def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:
     """Return the job that ``packed_job`` packed."""
-    item = replace(job.item, payload=unpacked_values(job.item.payload))
-    return replace(job, item=item, settings=tuple(unpacked_values(setting, enums) for setting in job.settings))
+    return _with_values(job, lambda values, _: unpacked_values(values, enums))
 
 
-def packed_outcome(outcome: Outcome) -> Outcome:
-    """Return an outcome as it travels back: without its setting, which the process that sent the job has."""
-    return replace(outcome, setting={}, kept=packed_values(outcome.kept, "Token"))
+def _with_values(job: Job, convert: Callable[[Mapping[str, Any], str], dict[str, Any]]) -> Job:
+    item = replace(job.item, payload=convert(job.item.payload, "Input"))
+    return replace(job, item=item, settings=tuple(convert(setting, "Hyperparameter") for setting in job.settings))
 
 
 def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
@@ -275,7 +277,11 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
     own = branched(runner)
     own.set(**unpacked_values(packaged.hyperparameters, enums))
     try:
-        return [packed_outcome(outcome) for outcome in run_job(own, unpacked_job(packaged.job, enums))]
+        # Without its setting, which the process that sent the job has.
+        return [
+            replace(outcome, setting={}, kept=packed_values(outcome.kept, "Token"))
+            for outcome in run_job(own, unpacked_job(packaged.job, enums))
+        ]
     except ScaleError as error:
         return str(error)
 
@@ -292,8 +298,9 @@ def _unpacked(files: Mapping[str, bytes]) -> Bundle:
 
 def _load_error(files: Mapping[str, bytes], error: BaseException) -> str:
     where = f"Worker process {os.getpid()} on {socket.gethostname()}"
-    requirements = files.get("requirements.txt", b"").decode()
+    requirements = files.get(REQUIREMENTS, b"").decode()
     needs = ", ".join(line for line in requirements.splitlines() if line and not line.startswith("#"))
     way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
-    reason = ended(f"{type(error).__name__}: {error}")
+    cause = error.__cause__ if isinstance(error.__cause__, ImportError) else error
+    reason = ended(f"{type(cause).__name__}: {cause}")
     return f"{where} can't load the graph: {reason} {way_out}; or use an executor of this machine."

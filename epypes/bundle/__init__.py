@@ -2,7 +2,7 @@
 
 from epypes.bundle.load import load, load_pipeline
 from epypes.bundle.promote import promote
-from epypes.bundle.replay import verify
+from epypes.bundle.replay_process import verify
 from epypes.bundle.to_source import to_source
 from epypes.bundle.writeback import WriteBack, write_back
 

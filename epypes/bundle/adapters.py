@@ -91,9 +91,9 @@ def answer_with(
     return f_out
 
 
-def is_usual(port: Callable[..., Any]) -> bool:
+def is_usual(adapter: Callable[..., Any]) -> bool:
     """Whether this is the f_in or f_out of a bundle that names none."""
-    return getattr(port, "__module__", None) == __name__
+    return getattr(adapter, "__module__", None) == __name__
 
 
 def detached(value: Any) -> Any:

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final, TypeGuard
 
 from epypes.bundle.expressions import is_same_data
-from epypes.bundle.notebook_source import nested_codes
+from epypes.bundle.objects import without_nodes
+from epypes.bundle.references import nested_codes
 from epypes.bundle.resolve import Refused, functions_of
 from epypes.graph import CompGraph, with_defaults, with_functions
 from epypes.pipeline import Node, Pipeline
@@ -19,16 +20,6 @@ from epypes.run import CompGraphRunner
 from epypes.run.guard import as_written
 
 # -- clones ------------------------------------------------------------------------------------------------------------
-
-
-def called_by(function: Any) -> Any:
-    """Return the function of a node that does nothing else than call it; anything else as it is."""
-    while isinstance(function, Node) and not isinstance(function, Pipeline):
-        kind = type(function)
-        if kind.compute is not Node.compute or kind.__call__ is not Node.__call__:
-            break
-        function = as_written(function.func)
-    return function
 
 
 def is_plain_pipeline(function: Any) -> TypeGuard[Pipeline]:
@@ -49,7 +40,7 @@ def clone_graph(cg: CompGraph) -> CompGraph:
 
 
 def _clone(function: Any) -> Any:
-    inner = called_by(function)
+    inner = without_nodes(function)
     if not is_plain_pipeline(inner):
         return inner
     hyperparameters = inner.runner.hyperparameters
@@ -129,13 +120,13 @@ _OF_EPYPES: Final = frozenset({
 })  # fmt: skip
 
 
-def is_set_elsewhere(made: Node, name: str) -> bool:
+def is_set_by_runs(made: Node, name: str) -> bool:
     """Whether an attribute of a node is one of EPypes, or one that a run sets: what it counts or remembers."""
     value = vars(made)[name]
-    return name in _OF_EPYPES or as_written(value) is not value or name in _set_by_runs(made)
+    return name in _OF_EPYPES or as_written(value) is not value or name in _attributes_set_by_runs(made)
 
 
-def _set_by_runs(made: Node) -> set[str]:
+def _attributes_set_by_runs(made: Node) -> set[str]:
     """Return the attributes that the methods set that a run calls: the hooks, and what the node was made to call."""
     functions: dict[str, Any] = {}
     for above in reversed(type(made).__mro__):

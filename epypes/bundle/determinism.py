@@ -3,7 +3,8 @@
 Two processes replay at the same time, each every sample twice. One of them has the usual conditions, in the other all
 of them are others: what the surroundings of a process may change, and nothing that a bundle computes. Where a token
 differs, replays with one other condition each find the one that changes it. Floats that differ by noise alone get a
-tolerance.
+tolerance. Both processes also describe how libraries are set and what they hold: what this process has otherwise, the
+notebook has changed, and it is refused also where no sample shows it.
 """
 
 from __future__ import annotations
@@ -22,25 +23,24 @@ from typing import Final
 
 from epypes.bundle.adapters import ANSWER
 from epypes.bundle.compare import Difference, add_tolerances
-from epypes.bundle.load import MODULE, SAMPLES, SETTINGS
-from epypes.bundle.manifest import write_manifest
-from epypes.bundle.replay import (
-    PRINT_OPTIONS,
-    REPLAY_TIMEOUT_S,
-    ReplayReport,
-    library_settings,
-    named_here,
-    replay_isolated,
-    without_python,
-)
-from epypes.bundle.requirements import REQUIREMENTS
+from epypes.bundle.file_access import named_here
+from epypes.bundle.libraries import WARNINGS, attributes_of, changed_attributes, is_of_texts, library_settings
+from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, write_manifest
+from epypes.bundle.replay import ReplayReport
+from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated, without_python
 from epypes.bundle.settings import read_settings
+from epypes.bundle.side_effects import place_of_change
 from epypes.errors import BundleError, PromotionRefused
 from epypes.optional import optional_import
 from epypes.wire.samples import load_sample, save_sample
 
 # As many as a replay of the usual and one of the other conditions.
 _PROCESSES: Final = 2
+# OpenCV reads the last one as what cv2.setNumThreads would set.
+_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+_MOST_NAMED: Final = 12
+# What a description ends with whose content is too long.
+_DIGEST: Final = re.compile(r" [0-9a-f]{16}\b.*")
 _VARIABLE: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 
 
@@ -91,7 +91,7 @@ def other_conditions(module: Path) -> tuple[Condition, ...]:
     """
     texts = (node.value for node in ast.walk(ast.parse(module.read_bytes())) if isinstance(node, ast.Constant))
     named = {text for text in texts if isinstance(text, str) and _VARIABLE.fullmatch(text)}
-    threads = "1" if os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())) != "1" else "3"
+    usual = str(len(os.sched_getaffinity(0)))
     return (
         Condition(
             "the variables of the environment",
@@ -121,10 +121,7 @@ def other_conditions(module: Path) -> tuple[Condition, ...]:
         Condition(
             "the number of threads (OMP_NUM_THREADS, cv2.setNumThreads)",
             "Compute it in one thread, or round the noise away before it decides anything.",
-            # OpenCV reads the last one as what cv2.setNumThreads would set.
-            dict.fromkeys(
-                ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), threads
-            ),
+            {name: "3" if os.environ.get(name, usual) == "1" else "1" for name in _THREADS},
         ),
     )
 
@@ -176,9 +173,10 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         refused |= {
             entry.token for entry in found if not entry.is_noise and (entry.token, entry.function) != (ANSWER, "f_out")
         }
-        changed = _changed_settings(usual)
-        notes = [changed.pop(PRINT_OPTIONS)] if PRINT_OPTIONS in changed else []
-        reasons = [*changed.values()]
+        settings = _changed_settings(usual, draft / MODULE)
+        notes = [reason for name, reason in settings.items() if is_of_texts(name)]
+        reasons = [reason for name, reason in settings.items() if not is_of_texts(name)]
+        reasons += [*_changed_libraries(usual, other, draft / MODULE), *usual.changes]
         if refused or usual.outside or not usual.tokens:
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
@@ -200,20 +198,50 @@ def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, change
     cwd = scratch / ("there" if any(condition.is_folder for condition in changed) else "here")
     cwd.mkdir(exist_ok=True)
     try:
-        return replay_isolated(draft, timeout_s=timeout_s, environment=environment, cwd=cwd)
+        return replay_isolated(draft, with_libraries=True, timeout_s=timeout_s, environment=environment, cwd=cwd)
     except BundleError as error:
         return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
 
 
-def _changed_settings(usual: ReplayReport) -> dict[str, str]:
+def _changed_settings(usual: ReplayReport, module: Path) -> dict[str, str]:
     """Return by name what this process has set in libraries that is set otherwise in a fresh one, as sentences."""
-    here = library_settings()
-    return {
-        name: f"The notebook has changed {name} ({here[name]}); a service has it as it is by default ({default}). "
-        "Change it inside the function that needs it, or set it back."
-        for name, default in usual.library_settings.items()
-        if here.get(name, default) != default
+    here, nodes = library_settings(), [*ast.walk(ast.parse(module.read_bytes()))]
+    catches = any(isinstance(node, ast.ExceptHandler) or getattr(node, "attr", "") == "suppress" for node in nodes)
+    found: dict[str, str] = {}
+    for name, default in usual.library_settings.items():
+        value = here.get(name, default)
+        if value != default and (name != WARNINGS or catches):
+            setting, _, option = name.partition(" ")
+            here_is = ", ".join(filter(None, (place_of_change(option or setting, is_call=not option), value)))
+            found[name] = (
+                f"The notebook has changed {name} ({here_is}); a service has it as it is by default "
+                f"({default or 'not set'}). Change it inside the function that needs it, or set it back."
+            )
+    return found
+
+
+def _changed_libraries(usual: ReplayReport, other: ReplayReport, module: Path) -> list[str]:
+    """Return what this process has changed in the libraries of a bundle, as sentences."""
+    # What two fresh processes have otherwise depends on the process, and is no change.
+    fresh = {
+        library: {name: value for name, value in described.items() if others.get(name, value) == value}
+        for library, described in usual.libraries.items()
+        if (others := other.libraries.get(library, described)) is not None
     }
+    changed = changed_attributes(attributes_of(fresh), fresh, module.read_text(encoding="utf-8"))
+    # One change is found wherever a library has the object; the shortest of these names is the best known.
+    distinct: dict[tuple[str, str, str], str] = {}
+    for (library, name), both in sorted(changed.items(), key=lambda item: len(item[0][0])):
+        distinct.setdefault((name, *both), library)
+    found = []
+    for (name, value, default), library in distinct.items():
+        here, there = (_DIGEST.sub("", text) for text in (value, default or "it is not there"))
+        here = ", ".join(filter(None, (place_of_change(name), here if here != there else "in its code or defaults")))
+        found.append(
+            f"The notebook has changed {library}.{name} ({here}); a service has it as it was installed ({there}). "
+            "Undo that; call yours by a name of its own, or make the value a token."
+        )
+    return found[:_MOST_NAMED]
 
 
 def _own_reasons(draft: Path, usual: ReplayReport, refused: Collection[str]) -> list[str]:

@@ -26,18 +26,28 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.clone import is_set_elsewhere
-from epypes.bundle.expressions import is_data, write_arrays
-from epypes.bundle.load import MODULE, execute
-from epypes.bundle.notebook_source import definition_of, lambdas_of, nested_codes, place_in, place_of, spelled_tree
-from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, meanings_of, without_nodes
-from epypes.bundle.resolve import annotated_names, layers, statements_of_class
+from epypes.bundle.arrays import ArrayFiles
+from epypes.bundle.clone import is_set_by_runs
+from epypes.bundle.expressions import is_data
+from epypes.bundle.load import execute
+from epypes.bundle.manifest import MODULE
+from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, without_nodes
+from epypes.bundle.references import meanings_of, nested_codes
+from epypes.bundle.resolve import (
+    annotated_names,
+    definition_of,
+    layers,
+    place_in,
+    place_of,
+    spelled_tree,
+    statements_of_class,
+)
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
 
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
-    "The bundle would have what the text of the cells makes. Run the cells that make it again, or make it a token."
+    "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token."
 )
 
 
@@ -72,22 +82,23 @@ Pair = tuple[str, Any, Any]
 _Definition = ast.FunctionDef | ast.Lambda
 
 
-def refusal(text: str, arrays: Mapping[str, Any], pairs: Callable[[Any], Iterable[Pair]]) -> str:
+def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], arrays: ArrayFiles | None = None) -> str:
     """Execute a module that was emitted, and return why its objects are not the notebook's; "" if they are.
 
     Parameters
     ----------
     text
         The module.
-    arrays
-        What it reads from files, by name.
     pairs
         Returns of the module what is compared: how a reason calls an object, the notebook's object and the module's.
+    arrays
+        What it reads from files.
     """
     with tempfile.TemporaryDirectory(prefix=_DRAFT) as folder:
         path = Path(folder) / MODULE
         path.write_text(text, encoding="utf-8")
-        write_arrays(path.parent, arrays)
+        if arrays is not None:
+            arrays.write(path.parent)
         try:
             return _refusal(path, pairs)
         finally:
@@ -166,7 +177,7 @@ class _Walk:
             raise _unlike(path, ours, theirs)
         left_out: tuple[str, ...] = (ANNOTATION,)
         if isinstance(ours, types.FunctionType) and ours.__code__ is not theirs.__code__:
-            node = _definition(ours.__code__)
+            node = definition_of(ours.__code__)[1]
             if path.part and node is not None:
                 path = _Path(path.root, _placed(f"Function {ours.__name__!r}", ours))
             left_out += self._compare_code(path, node, ours, theirs)
@@ -174,7 +185,7 @@ class _Walk:
             path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours))
         elif isinstance(ours, Node):
             nodes = ours, theirs
-            names = [name for node in nodes for name in vars(node) if is_set_elsewhere(node, name)]
+            names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
 
@@ -191,7 +202,7 @@ class _Walk:
         self, path: _Path, node: _Definition | None, ours: types.FunctionType, theirs: types.FunctionType
     ) -> tuple[str, ...]:
         """Compare two functions by their texts; return which parts that covers. Without a text it covers none."""
-        other = _definition(theirs.__code__)
+        other = definition_of(theirs.__code__)[1]
         if node is None and other is None:
             return ()
         if node is None or other is None or not _is_same_text(ours.__code__, node, theirs.__code__, other):
@@ -240,14 +251,6 @@ def _without(parts: Iterable[tuple[str, Any]], left_out: tuple[str, ...]) -> dic
 
 
 # -- functions -------------------------------------------------------------------------------------------------------
-
-
-def _definition(code: types.CodeType) -> _Definition | None:
-    """Return the definition of some code; None if there is no text that compiles to it."""
-    if code.co_name != "<lambda>":
-        return definition_of(code)[1]
-    _, nodes = lambdas_of(code)
-    return nodes[0] if len({ast.dump(node) for node in nodes}) == 1 else None
 
 
 def _is_same_text(code: types.CodeType, node: _Definition, other_code: types.CodeType, other: _Definition) -> bool:

@@ -1,8 +1,4 @@
-"""Expressions: the source text that makes a value again, with the imports that it needs, and its layout.
-
-Arrays that are too large for text stand in ``arrays/NAME.npy`` beside the module, named as the notebook names them; one
-small function reads them.
-"""
+"""Expressions: the source text that makes a value again, with the imports that it needs, and its layout."""
 
 from __future__ import annotations
 
@@ -18,13 +14,12 @@ import pathlib
 import re
 import types
 import unicodedata
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import timedelta
 from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Union, get_origin
 
 from epypes.bundle.resolve import Importable, Refused, importable
@@ -287,23 +282,8 @@ class _Writer:
             order = "" if array.flags.c_contiguous else ', order="F"'
             numpy = self.gathered.module_name("numpy", self.what)
             source = f'{numpy}.array({listed}, dtype="{array.dtype}"{order})'
-        if (source and len(source) <= _MOST_CHARACTERS) or not self.gathered.stores_arrays:
-            return source
-        return self._stored_array(array) if array.dtype.kind in "biufc" else ""
-
-    def _stored_array(self, array: Any) -> str:
-        """Store an array of numbers as a file; return the call that reads it."""
-        gathered, arrays = self.gathered, self.gathered.arrays
-        name = next((name for name, other in arrays.items() if other is array), "")
-        if not name:
-            if READER not in gathered.definitions:
-                gathered.reserve(READER)
-                modules = {name: gathered.module_name(name, self.what) for name in ("numpy", "pathlib")}
-                gathered.definitions[READER] = _TEXT.format(reader=READER, folder=ARRAYS, **modules)
-                gathered.reads[READER] = frozenset()
-            name = identifier_of(self.wanted or "array", arrays.__contains__)
-            arrays[name] = array
-        return f'{READER}("{name}")'
+        is_text = source and len(source) <= _MOST_CHARACTERS
+        return source if is_text else self.gathered.store_array(array, self.wanted or "array", self.what) or source
 
 
 def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
@@ -331,26 +311,6 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         if isinstance(value, np.number | np.bool_):
             return kind, (value.item(),)
     return None
-
-
-# -- arrays in files ---------------------------------------------------------------------------------------------------
-
-ARRAYS: Final = "arrays"
-READER: Final = "stored_array"
-_TEXT: Final = '''def {reader}(name):
-    """Return an array that this bundle keeps as a file; it can't be written to."""
-    array = {numpy}.load({pathlib}.Path(__file__).with_name("{folder}") / f"{{name}}.npy", allow_pickle=False)
-    array.flags.writeable = False
-    return array'''
-
-
-def write_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays into a bundle, each into the file of this name, in the order of its elements, to the last bit."""
-    for file, array in arrays.items():
-        import numpy as np
-
-        (folder / file).parent.mkdir(exist_ok=True)
-        np.save(folder / file, array, allow_pickle=False)
 
 
 # -- line breaks -------------------------------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ each, and then equal digests are no proof that nothing has changed.
 
 from __future__ import annotations
 
-import dis
 import hashlib
 import importlib
 import importlib.util
@@ -25,7 +24,6 @@ from importlib import metadata
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.bundle.notebook_source import nested_codes
 from epypes.bundle.objects import (
     ATOMS,
     CACHED,
@@ -37,6 +35,7 @@ from epypes.bundle.objects import (
     is_of_library,
     without_nodes,
 )
+from epypes.bundle.references import imported_modules, nested_codes
 from epypes.bundle.requirements import bringing
 
 _DIGEST_BYTES: Final = 16
@@ -52,7 +51,6 @@ _READERS: Final = frozenset({
 })  # fmt: skip
 # The folders that pip, and Debian's packages, install into.
 _INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
-_LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset(
     {"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "pathlib", "uuid"}
@@ -208,7 +206,7 @@ class Digester:
         if by_text or "import_module" in used:
             self._add_unknown(function, f"a call of {by_text or 'import_module'!r}")
         found: list[tuple[str, Any]] = []
-        for name in _imported_within(codes, function.__globals__.get("__package__") or ""):
+        for name in imported_modules(function):
             with suppress(Exception):  # the function raises the same when it is called
                 if _will_be_installed(name.partition(".")[0]):
                     self._met.add(name)
@@ -256,18 +254,3 @@ def _will_be_installed(top: str) -> bool:
         return is_installed(top)
     spec = importlib.util.find_spec(top)
     return spec is not None and not _INSTALLED.isdisjoint(Path(spec.origin or "").parts)
-
-
-def _imported_within(codes: Iterable[types.CodeType], package: str) -> list[str]:
-    """Return the names of all that code in a package may import when it runs."""
-    found: set[str] = set()
-    for code in codes:
-        # Before each import statement, its level and the names that it takes are loaded.
-        steps = [one for one in dis.get_instructions(code) if one.opname in {*_LOADS_CONSTANT, "IMPORT_NAME"}]
-        for level, taken, step in zip(steps, steps[1:], steps[2:], strict=False):
-            if step.opname == "IMPORT_NAME":
-                with suppress(ImportError):  # a relative import beyond the package
-                    name = importlib.util.resolve_name("." * level.argval + step.argval, package)
-                    # A name that is taken from a package may be a module of it.
-                    found |= {name, *(f"{name}.{one}" for one in taken.argval or ())}
-    return sorted(found)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import traceback
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -11,18 +12,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
-from epypes.bundle.manifest import bundle_files, check_manifest
+from epypes.bundle.arrays import StoredArray, read_array
+from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, bundle_files, check_manifest
 from epypes.bundle.mutable_state import MutableState
-from epypes.bundle.settings import Settings, StoredArray, load_array, read_settings
+from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
 from epypes.pipeline import FullPipeline
 from epypes.run import CompGraphRunner
 from epypes.run.guard import called_for
 
-MODULE: Final = "pipeline.py"
-SETTINGS: Final = "pipeline.toml"
-SAMPLES: Final = "samples"
 MAKER: Final = "make_pipeline"
 # Two bundles of one name must not take each other's place among the modules.
 _EXECUTING: Final = threading.RLock()
@@ -43,7 +42,7 @@ class Bundle:
     digest
         Its digest; empty if its manifest was not compared.
     own
-        What its module has of its own in place of the usual ports and pipeline, by the names in ``settings.own``.
+        What its module has of its own in place of the usual adapters and pipeline, by the names in ``settings.own``.
     enums
         The enumerations whose members are values of hyperparameters, by name.
     """
@@ -92,12 +91,12 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
                 raise BundleError(folder, f"{folder} has no {MODULE}. Promote the graph again.")
             for file in files:
                 if file.endswith(".npy"):
-                    load_array(folder / file, "r")
-            module = execute(folder / MODULE, (folder / MODULE).read_bytes())
+                    read_array(folder / file, "r")
+            module = _imported(folder)
             enums = getattr(module, "enums", {})
             settings = read_settings(folder / SETTINGS, enums)
             values = {
-                token: load_array(folder / value.file) if type(value) is StoredArray else value
+                token: read_array(folder / value.file) if type(value) is StoredArray else value
                 for token, value in settings.hyperparameters.items()
             }
         except Exception:  # whatever the module's own code raises
@@ -107,17 +106,32 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         # A promotion swaps another folder in: then what was read, also by the module, may be of both.
         if _identity(folder) == before:
             break
-    try:
-        own = {name: getattr(module, name) for name in settings.own}
-        ports = {name: port for name, port in own.items() if name != MAKER}
-        state = MutableState({**module.func_dict, **ports}, values)
-        cg = _graph(module, state.guarded(module.func_dict), settings)
-        own |= {name: called_for(name, port) for name, port in state.guarded(ports).items()}
-    except (AttributeError, KeyError, TypeError) as error:
-        missing = repr(error.name) if isinstance(error, AttributeError) else error
-        text = f"{folder / MODULE} defines no {missing}, which the bundle needs. Promote the graph again."
-        raise BundleError(folder, text) from error
+    needed = ("func_dict", "func_io", *(("func_groups",) if settings.has_groups else ()), *settings.own)
+    missing = [name for name in needed if not hasattr(module, name)]
+    if missing:
+        names = ", ".join(map(repr, missing))
+        text = f"{folder / MODULE} defines no {names}, which the bundle needs. Promote the graph again."
+        raise BundleError(folder, text)
+    own = {name: getattr(module, name) for name in settings.own}
+    adapters = {name: adapter for name, adapter in own.items() if name != MAKER}
+    state = MutableState({**module.func_dict, **adapters}, values)
+    cg = _graph(module, state.guarded(module.func_dict), settings)
+    own |= {name: called_for(name, adapter) for name, adapter in state.guarded(adapters).items()}
     return Bundle(folder, cg, replace(settings, hyperparameters=values), digest, own, enums)
+
+
+def _imported(folder: Path) -> Any:
+    """Execute a bundle's module; what it can't import is named with the way out."""
+    path = folder / MODULE
+    try:
+        return execute(path, path.read_bytes())
+    except ImportError as error:
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        where = f" at line {frames[-1].lineno}, {frames[-1].line!r}" if frames else ""
+        text = f"{path} can't be imported{where}: {type(error).__name__}: {error}"
+        way_out = "Only installed packages can be imported in a bundle: install what its"
+        text = f"{text}. {way_out} {REQUIREMENTS} lists, or move the code into the notebook and promote it again."
+        raise BundleError(folder, text) from error
 
 
 def _graph(module: Any, functions: Mapping[str, Callable[..., Any]], settings: Settings) -> CompGraph:

@@ -24,8 +24,13 @@ from typing import Final
 
 from epypes.errors import BundleChanged, BundleError
 
+# The files of a bundle.
+MODULE: Final = "pipeline.py"
+SETTINGS: Final = "pipeline.toml"
+SAMPLES: Final = "samples"
+REQUIREMENTS: Final = "requirements.txt"
 MANIFEST: Final = "MANIFEST.sha256"
-_TEXTS: Final = ("pipeline.py", "pipeline.toml", "requirements.txt")
+_TEXTS: Final = (MODULE, SETTINGS, REQUIREMENTS)
 # What a comment of the manifest begins with.
 _FACT: Final = "# "
 _LINES: Final = "lines of "
@@ -101,7 +106,7 @@ def why_no_bundle(folder: Path) -> str:
         present, (recorded, _) = bundle_files(folder), _read_manifest(folder)
     except BundleError as error:
         return f"{folder} exists and is not a bundle: {error}"
-    if not {"pipeline.py", "pipeline.toml"} <= recorded.keys():
+    if not {MODULE, SETTINGS} <= recorded.keys():
         return f"{folder} exists and is not a bundle."
     foreign = [name for name in present if name not in recorded]
     return f"{folder} has files that are not the bundle's: {', '.join(foreign):.200}." if foreign else ""

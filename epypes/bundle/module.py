@@ -13,13 +13,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import arguments_of, parameters_of
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import ARRAYS, LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
+from epypes.bundle.expressions import LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.notebook_source import Position, parsed
 from epypes.bundle.objects import without_nodes
-from epypes.bundle.resolve import Refused
+from epypes.bundle.resolve import Position, Refused, parsed
 from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import run_call
@@ -33,7 +33,7 @@ _NOT_MADE_AGAIN: Final = (
     "is made with a {kind} that no expression makes again. Make it in __init__, from numbers, strings, a small array "
     "or tuples of them."
 )
-_PORTS: Final = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
+_ADAPTER_COMMENTS: Final = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
 # The folder is wherever the bundle is: it may be moved.
 _TEXT: Final = '''"""{title}
 
@@ -51,9 +51,9 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 
 
 def write_module(
-    cg: CompGraph, settings: Settings, ports: Mapping[str, Callable[..., Any]], pipeline: Pipeline | None
-) -> tuple[str, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the arrays that it reads by file, and the reasons against it.
+    cg: CompGraph, settings: Settings, adapters: Mapping[str, Callable[..., Any]], pipeline: Pipeline | None
+) -> tuple[str, ArrayFiles, list[str]]:
+    """Return the text of ``pipeline.py``, the arrays that it reads from files, and the reasons against it.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def write_module(
         The graph with the user's own functions.
     settings
         The bundle's settings.
-    ports
+    adapters
         f_in and f_out, as far as they are not the usual ones of a bundle.
     pipeline
         The pipeline that is promoted, if it is of a class of the user's.
@@ -74,12 +74,12 @@ def write_module(
     def write(gathered: Slice) -> dict[str, str]:
         graphs, definitions = Graphs(gathered), gathered.definitions
         references = graphs.write(cg)
-        for name, port in ports.items():
-            reference = graphs.value(port, f"Function {name!r}", name)
+        for name, adapter in adapters.items():
+            reference = graphs.value(adapter, f"Function {name!r}", name)
             if reference != name:
                 with gathered.noted_refusals():
                     gathered.reserve(name)
-                definitions[name] = f"{_PORTS[name]}\n{name} = {reference}"
+                definitions[name] = f"{_ADAPTER_COMMENTS[name]}\n{name} = {reference}"
         if pipeline is not None:
             with gathered.noted_refusals():
                 definitions[MAKER] = graphs.maker(pipeline)
@@ -91,21 +91,20 @@ def write_module(
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
     gathered, references = gather(write, reserved, stores_arrays=True)
     if gathered.refusals:
-        return "", {}, list(dict.fromkeys(gathered.refusals))
-    arrays = {f"{ARRAYS}/{name}.npy": array for name, array in gathered.arrays.items()}
+        return "", gathered.arrays, list(dict.fromkeys(gathered.refusals))
     module = emit_module(settings, cg, gathered, references)
-    why = refusal(module, arrays, functools.partial(_pairs, cg, ports, pipeline, enums))
-    return module, arrays, [why] if why else []
+    why = refusal(module, functools.partial(_pairs, cg, adapters, pipeline, enums), gathered.arrays)
+    return module, gathered.arrays, [why] if why else []
 
 
 def _pairs(
-    cg: CompGraph, ports: Mapping[str, Any], pipeline: Pipeline | None, enums: Mapping[str, type], module: Any
+    cg: CompGraph, adapters: Mapping[str, Any], pipeline: Pipeline | None, enums: Mapping[str, type], module: Any
 ) -> Iterator[Pair]:
     """Give what of the notebook is compared with the module, by how a reason calls it."""
     for name, function in cg.functions.items():
         yield f"Function {name!r}", function, module.func_dict[name]
-    for name, port in ports.items():
-        yield f"Function {name!r}", port, getattr(module, name)
+    for name, adapter in adapters.items():
+        yield f"Function {name!r}", adapter, getattr(module, name)
     for name, kind in enums.items():
         yield f"Class {name!r}", kind, module.enums[name]
     if pipeline is not None:
@@ -123,7 +122,7 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
     Parameters
     ----------
     settings
-        The bundle's name and ports.
+        The bundle's name and adapters.
     cg
         The graph.
     needed

@@ -21,6 +21,10 @@ a function may seed them for another one, and the replay finds draws without a s
 
 Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.
+
+What a guarded call calls is part of it. Its context says so, which also reaches the helper threads of a runner, but not
+those of a function's own ``ThreadPoolExecutor``. There a node that a function refers to is part of the calls that are
+running: to wait for one of them could be to wait for its own caller.
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from typing import Any, Final
 
+from epypes.bundle.references import cells_of, defaults_of, global_names, imported_modules, meanings_of, nested_codes
 from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
@@ -86,16 +91,19 @@ class CodeSnapshot(Snapshot):
 
     Attributes
     ----------
-    settlers
+    resets
         What puts back or forgets, after each call, what a call may change without a failure.
+    nodes
+        The nodes and pipelines that were met, by id.
     """
 
     def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
         self._compared, self._lock = compared, lock
-        self.settlers: list[Callable[[], object]] = []
+        self.resets: list[Callable[[], object]] = []
+        self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
         self._code: set[str] = set()  # its names and instructions
-        # What is compared or settled if the code has one of the names or instructions.
+        # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
         super().__init__(functions)
         for needed, add in self._possible:
@@ -104,7 +112,7 @@ class CodeSnapshot(Snapshot):
         self._possible.clear()
 
     def __bool__(self) -> bool:
-        return bool(self.records or self.settlers or self._caches)
+        return bool(self.records or self.resets or self._caches)
 
     def changed(self) -> str | None:
         """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
@@ -117,13 +125,13 @@ class CodeSnapshot(Snapshot):
                     return name
         return None
 
-    def settle(self) -> None:
+    def reset(self) -> None:
         """Put back or forget what a call may change without a failure."""
-        for settle in self.settlers:
-            settle()
+        for reset in self.resets:
+            reset()
         for _, _, values in self._caches:
             for value in values:
-                value.settle()
+                value.reset()
 
     def restored(self) -> bool:
         """Put everything back, and return whether that was possible."""
@@ -160,7 +168,7 @@ class CodeSnapshot(Snapshot):
                 _check_caches(attributes)
             lazy = cached_properties(kind)
             if lazy:
-                self.settlers.append(functools.partial(_forget, value, lazy))
+                self.resets.append(functools.partial(_forget, value, lazy))
         elif not _MODELS_OF_CV2.isdisjoint(base.__name__ for base in kind.__mro__ if base.__module__[:3] == "cv2"):
             self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
@@ -185,33 +193,26 @@ class CodeSnapshot(Snapshot):
         _check_caches(known)
         self._compare(_BINDS, functools.partial(_Bindings, "", known))
         self._compare(_BINDS, functools.partial(_Bindings, f"{function.__name__}.", function))
-        for name in self._read(code):
-            is_imported = f"IMPORT_NAME {name}" in self._code
-            yield name, known.get(name, sys.modules.get(name) if is_imported else None)
-        for name, cell in _cells(function):
+        for inner in nested_codes(code):
+            self._note_instructions(inner)
+        yield from meanings_of(function, global_names(code)).items()
+        yield from ((name, sys.modules.get(name)) for name in imported_modules(function))
+        for name, cell in cells_of(function).items():
             cell.cell_contents = _checked(cell.cell_contents)
             self._compare(_BINDS, functools.partial(Record, name, cell, _read_cell, _write_cell))
             yield name, cell.cell_contents
-        arguments = code.co_varnames[: code.co_argcount]
-        defaults = function.__defaults__ or ()
-        yield from zip(arguments[len(arguments) - len(defaults) :], defaults, strict=True)
-        yield from (function.__kwdefaults__ or {}).items()
+        yield from defaults_of(function).items()
         attributes = function.__dict__.items()
         yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
 
-    def _read(self, code: types.CodeType) -> dict[str, None]:
-        """Note the names and instructions of some code, and return the names that it reads."""
-        names = dict.fromkeys(code.co_names)
+    def _note_instructions(self, code: types.CodeType) -> None:
+        """Note the names of some code, and the instructions by which it binds them."""
+        self._code.update(code.co_names)
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
-            if operation.startswith(("STORE_", "DELETE_", "IMPORT_NAME")):
+            if operation.startswith(("STORE_", "DELETE_")):
                 is_free = operation.endswith("_DEREF") and name in code.co_freevars
                 self._code |= {operation, f"{operation} {name}", *(["nonlocal"] if is_free else [])}
-        for constant in code.co_consts:
-            if isinstance(constant, types.CodeType):
-                names |= self._read(constant)
-        self._code.update(names)
-        return names
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):
@@ -229,6 +230,7 @@ class CodeSnapshot(Snapshot):
 
     def _look_at_node(self, name: str, node: Node) -> Found:
         """Look into a node of a nested graph; what EPypes itself has in it is no state of the user's."""
+        self.nodes[id(node)] = node
         if isinstance(node, Pipeline):
             yield from node.cg.functions.items()
             return
@@ -236,7 +238,7 @@ class CodeSnapshot(Snapshot):
         yield type(node).__name__, type(node)
         if type(node) is not Node:
             record = _Bindings(f"{name}.", node)
-            self._possible.append((_BINDS, lambda: self.settlers.append(record.restore)))
+            self._possible.append((_BINDS, lambda: self.resets.append(record.restore)))
             yield from ((f"{name}.{key}", value) for key, value in _bound(node).items())
 
     def _look_at_cache(self, name: str, cached: Any) -> Found:
@@ -244,7 +246,7 @@ class CodeSnapshot(Snapshot):
         if is_own(str(cached.__module__)):
             values = vars(cached).get(_VALUES)
             if values is None:
-                self.settlers.append(cached.cache_clear)
+                self.resets.append(cached.cache_clear)
             else:
                 self._caches.append((name, cached, values))
         yield name, cached.__wrapped__
@@ -270,7 +272,7 @@ def _wrapped_by(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
     registry = function.__dict__.get("registry")
     held = [function.__dict__.get("__wrapped__")]
     held += registry.values() if isinstance(registry, types.MappingProxyType) else []
-    held += [cell.cell_contents for _, cell in _cells(function)]
+    held += [cell.cell_contents for cell in cells_of(function).values()]
     yield from ((function.__name__, value) for value in held if callable(value) and not isinstance(value, type))
 
 
@@ -336,12 +338,6 @@ def _write_bindings(value: Any, saved: tuple[Any, ...]) -> None:
             bind(value, name, part)
 
 
-def _cells(function: types.FunctionType) -> list[tuple[str, types.CellType]]:
-    """Return the variables of a closure that have a value, by name."""
-    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-    return [(name, cell) for name, cell in cells if cell != types.CellType()]
-
-
 def _read_cell(cell: types.CellType) -> tuple[Any, ...]:
     return (cell.cell_contents,)
 
@@ -396,8 +392,8 @@ def _checked(cached: Any) -> Any:
 
 # -- calls ---------------------------------------------------------------------------------------------------------
 
-# The turns of the guarded call under way. What that calls, also in helper threads, is part of it.
-_under_way: ContextVar[object] = ContextVar("_under_way", default=None)
+# The lock that a guarded call in this context holds. What that calls is part of it, also in a runner's helper threads.
+_held: ContextVar[object] = ContextVar("_held", default=None)
 
 
 class MutableState:
@@ -412,11 +408,13 @@ class MutableState:
     """
 
     def __init__(self, functions: Mapping[str, Callable[..., Any]], hyperparameters: Mapping[str, Any]) -> None:
-        self._turns = _Turns()
+        self._lock = _ReadersWriterLock()
         self._shared = {
             f"hyperparameter {token}": value for token, value in hyperparameters.items() if _has_containers(value)
         }
         self._compared: dict[int, object] = {}
+        # The nodes, also of pipelines, that functions refer to and may call themselves, by id.
+        self._referred: dict[int, Node] = {}
         for name, function in _with_inner(functions):
             if is_unguarded(function):
                 # It rejects read-only arrays.
@@ -442,50 +440,62 @@ class MutableState:
         if type(function) in (types.FunctionType, functools.partial, _CACHED):
             # It stays what the module defines, so that it can be promoted again.
             setattr(function, WATCH, functools.partial(self._guarded_call, function=function, snapshot=snapshot))
+            self._refer_to(snapshot.nodes)
             return function
         if not isinstance(function, Node):
             return self._guarded_call(name, function, snapshot)
+        self._refer_to({key: node for key, node in snapshot.nodes.items() if node is not function})
         if type(function).compute is Node.compute:
-            function.func = self._guarded_call(name, function.func, snapshot)
+            function.func = self._guarded_call(name, function.func, snapshot, function)
         else:
-            function.compute = self._guarded_call(name, function.compute, snapshot)  # type: ignore[method-assign]
+            function.compute = self._guarded_call(name, function.compute, snapshot, function)  # type: ignore[method-assign]
         return function
 
-    def _guarded_call(self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot) -> Callable[..., Any]:
-        turns = self._turns
+    def _refer_to(self, nodes: Mapping[int, Node]) -> None:
+        for key, node in nodes.items():
+            self._referred[key] = node
+            if isinstance(node, Pipeline):
+                self._refer_to({id(inner): inner for inner in node.network.nodes.values()})
+
+    def _guarded_call(
+        self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
+    ) -> Callable[..., Any]:
+        lock, referred = self._lock, self._referred
 
         def attempt(args: Any, kwargs: Any) -> tuple[Any, BaseException | None]:
-            token = _under_way.set(turns)
+            token = _held.set(lock)
             try:
                 return function(*args, **kwargs), None
             except BaseException as error:
                 return None, error
             finally:
-                _under_way.reset(token)
-                snapshot.settle()
+                _held.reset(token)
+                snapshot.reset()
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
-            if _under_way.get() is turns:
+            # Another call of the bundle may have made this one in a thread of its own, which has no context.
+            ticket = lock.acquire_read(only_if_free=id(node) in referred) if _held.get() is not lock else None
+            if ticket is None:
                 return function(*args, **kwargs)
-            number, is_alone, is_restored = turns.share(), bool(snapshot.settlers), True
+            is_exclusive, is_restored = bool(snapshot.resets), True
             try:
-                if is_alone:
-                    turns.claim(number)
+                if is_exclusive:
+                    lock.upgrade(ticket)
                     if snapshot.changed() is not None:  # by a call that waits to put it back
                         snapshot.restored()
                 result, error = attempt(args, kwargs)
                 changed = snapshot.changed()
-                if changed is not None and not is_alone:
-                    is_alone = True
-                    if not turns.claim(number):
+                if changed is not None and not is_exclusive:
+                    is_exclusive = True
+                    if not lock.upgrade(ticket):
                         snapshot.restored()
                         result, error = attempt(args, kwargs)
                         changed = snapshot.changed()
                 if changed is not None:
                     is_restored = snapshot.restored()
             finally:
-                turns.leave(is_alone)
+                lock.release(is_exclusive)
             try:
                 if error is not None:
                     raise error
@@ -501,29 +511,36 @@ class MutableState:
         return call
 
 
-class _Turns:
-    """The calls under way: they share the objects, until one claims to have them alone."""
+class _ReadersWriterLock:
+    """A lock that calls share as readers, each of which may become the writer, which has the objects alone.
+
+    Readers that wait to become the writer count as ended, so they don't wait for one another. No reader begins then.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._changed = threading.Condition(self._lock)
-        # Calls under way but for those that wait; calls that claim to be alone; calls begun so far.
-        self._running = self._claims = self._begun = 0
+        self._changed = threading.Condition(threading.Lock())
+        # Readers that are running; those that are, or wait to become, the writer; readers begun so far.
+        self._running = self._writers = self._begun = 0
 
-    def share(self) -> int:
-        """Begin a call; return its number, or 0 if others are running."""
-        with self._lock:
-            while self._claims:
+    def acquire_read(self, *, only_if_free: bool = False) -> int | None:
+        """Begin as a reader; return a ticket for ``upgrade``: 0 if others are running.
+
+        With ``only_if_free`` nothing is acquired, and None is returned, where others are running.
+        """
+        with self._changed:
+            if only_if_free and (self._running or self._writers):
+                return None
+            while self._writers:
                 self._changed.wait()
             self._running += 1
             self._begun += 1
             return self._begun if self._running == 1 else 0
 
-    def claim(self, number: int) -> bool:
-        """Wait for the others to end or to wait, and let none begin; return whether there was none since ``number``."""
-        with self._lock:
-            was_alone = number == self._begun
-            self._claims += 1
+    def upgrade(self, ticket: int) -> bool:
+        """Become the writer when all other readers have ended; return whether none ran since the ticket was given."""
+        with self._changed:
+            was_alone = ticket == self._begun
+            self._writers += 1
             self._running -= 1
             self._changed.notify_all()
             try:
@@ -533,13 +550,13 @@ class _Turns:
                 self._running += 1
             return was_alone
 
-    def leave(self, is_alone: bool) -> None:
-        """End a call."""
-        with self._lock:
+    def release(self, is_writer: bool) -> None:
+        """End as a reader or as the writer."""
+        with self._changed:
             self._running -= 1
-            if self._claims:
+            if self._writers:
                 self._changed.notify_all()
-            self._claims -= is_alone
+            self._writers -= is_writer
 
 
 def _has_containers(value: Any) -> bool:

@@ -10,7 +10,6 @@ a name, by that name. An object of the user's classes is made of its attributes 
 
 from __future__ import annotations
 
-import builtins
 import copyreg
 import dataclasses
 import enum
@@ -27,8 +26,7 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple, cast
 
 from epypes.bundle.expressions import has_steady_order
-from epypes.bundle.notebook_source import names_from_outside, nested_codes
-from epypes.bundle.resolve import defaults_of
+from epypes.bundle.references import defaults_of, global_names, meanings_of, nested_codes
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner
@@ -122,7 +120,7 @@ def atom_content(value: Any) -> str | bytes:
 
 
 def without_nodes(value: Any) -> Any:
-    """Return the function of a node that does nothing else than call it; anything else as the notebook wrote it."""
+    """Return the function of a plain node; anything else, also a node of the user's own class, as it was written."""
     value = as_written(value)
     while type(value) is Node:
         value = as_written(value.func)
@@ -179,8 +177,7 @@ def _function(function: types.FunctionType) -> Description:
     code = function.__code__
     # The code of a library says what it reads of its own module.
     home = str(function.__globals__.get("__name__")) if is_of_library(function) else ""
-    read = () if home else (name for inner in nested_codes(code) for name in names_from_outside(inner))
-    meanings = meanings_of(function, {*code.co_freevars, *read})
+    meanings = meanings_of(function, {*code.co_freevars, *(() if home else global_names(code))})
     parts: list[tuple[str, Any]] = [(CODE, code)]
     parts += ((f" default of {name!r}", value) for name, value in sorted(defaults_of(function).items()))
     parts += _annotations(function)
@@ -190,21 +187,6 @@ def _function(function: types.FunctionType) -> Description:
         parts += ((f" {name!r}", meanings[name]) for name in sorted(meanings))
         parts += _marks(function)
     return Description("function", (home,), parts, module=str(function.__module__))
-
-
-def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str, Any]:
-    """Return what names mean to a function, by what it has captured, its globals and the builtins."""
-    cells = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
-    found: dict[str, Any] = {}
-    for name in names:
-        if name in cells:
-            with suppress(ValueError):  # nothing has been assigned yet
-                found[name] = cells[name].cell_contents
-        elif name in function.__globals__:
-            found[name] = function.__globals__[name]
-        elif hasattr(builtins, name):
-            found[name] = getattr(builtins, name)
-    return found
 
 
 def is_of_library(function: types.FunctionType) -> bool:
@@ -362,17 +344,17 @@ def _library_object(value: Any) -> Description:
             raise TypeError(f"{made!r} can't be found in {module!r}")
         return Description("global", (module, made), module=module)
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]
-    parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _lasting(kind, state))]
+    parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _without_computed(kind, state))]
     parts += [(" items", [*(items or ())]), (" entries", [*(pairs or ())])]
     # A method of an object is no state, but the object is.
     is_state = not isinstance(value, types.BuiltinFunctionType)
     return Description(kind.__name__, parts=parts, is_state=is_state, is_pickled=True)
 
 
-def _lasting(kind: type, state: Any) -> Any:
+def _without_computed(kind: type, state: Any) -> Any:
     """Return a state without what is computed from the rest when it is first needed."""
     if type(state) is tuple and len(state) == 2 and type(state[0]) is dict:
-        return _lasting(kind, state[0]), state[1]
+        return _without_computed(kind, state[0]), state[1]
     computed = {*cached_properties(kind), *({"_ufunc"} if (kind.__module__, kind.__name__) == _VECTORIZE else ())}
     return (
         {name: state[name] for name in sorted(state, key=str) if name not in computed} if type(state) is dict else state

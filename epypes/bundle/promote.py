@@ -2,32 +2,48 @@
 
 Slice what the functions need, write the module, record the samples, replay them in fresh isolated processes, pin what
 those imported, write the manifest. Each step may refuse with a reason and a way out; none guesses. Only a bundle that
-passed them all replaces an older one.
+passed them all replaces an older one, in one step.
+
+A notebook file is executed in a new kernel, and its graph is promoted there. The kernel sends the progress, and the
+reasons against a promotion, as displayed data of a type of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
 import os
+import shutil
+import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
+from epypes.bundle.arrays import store_hyperparameters
 from epypes.bundle.clone import clone_runner, parameters_of
 from epypes.bundle.determinism import prove
-from epypes.bundle.draft import draft_folder, swap_folders
-from epypes.bundle.expressions import write_arrays
-from epypes.bundle.load import MAKER, MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
-from epypes.bundle.manifest import MANIFEST, why_no_bundle
+from epypes.bundle.load import MAKER, Bundle, read_bundle
+from epypes.bundle.manifest import MANIFEST, MODULE, SAMPLES, SETTINGS, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import Settings, store_arrays, unwritable, writable_defaults, write_settings
-from epypes.errors import EpypesError, MessageError, PromotionRefused, run_call
+from epypes.bundle.settings import MOST_NUMBERS, Settings, unwritable, writable_defaults, write_settings
+from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
 from epypes.graph import colour_order
+from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import as_written
+
+# From Linux's fcntl.h and fs.h.
+_AT_FDCWD: Final = -100
+_RENAME_EXCHANGE: Final = 2
+# What the names of folders end with in which drafts are.
+_DRAFTS: Final = ".epypes-draft"
+_MEDIA_TYPE: Final = "application/vnd.epypes.promotion+json"
 
 
 def _ignore(text: str) -> None:
@@ -72,11 +88,11 @@ def promote(
     # A link that names the current version goes on naming it; what it points to is replaced.
     target = Path(os.path.realpath(to))
     try:
-        ports = _ports(runner_or_pipeline, f_in, f_out)
+        adapters = _adapters(runner_or_pipeline, f_in, f_out)
         _check_place(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_folder(target) as draft:
-            _write(draft, target, runner_or_pipeline, ports, outputs, samples)
+            _write(draft, target, runner_or_pipeline, adapters, outputs, samples)
             on_progress("replaying in fresh processes")
             for note in prove(draft, target).notes:
                 on_progress(note)
@@ -90,19 +106,21 @@ def promote(
     return read_bundle(target)
 
 
-def _ports(given: object, f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]]:
+def _adapters(given: object, f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]]:
     """Return f_in and f_out as the user wrote them, as far as they are not the usual ones of a bundle."""
-    ports = {"f_in": f_in, "f_out": f_out}
-    for name, port in ports.items():
-        if port is not None and not callable(port):
-            raise Refused(f"{name} must be a function, not {type(port).__name__!r}.")
-    if isinstance(given, Pipeline):  # its class may also make a port itself
+    adapters = {"f_in": f_in, "f_out": f_out}
+    for name, adapter in adapters.items():
+        if adapter is not None and not callable(adapter):
+            raise Refused(f"{name} must be a function, not {type(adapter).__name__!r}.")
+    if isinstance(given, Pipeline):  # its class may also make a adapter itself
         taken = {parameter.name for parameter in parameters_of(type(given))}
-        ports |= {name: getattr(given, name, None) for name in ports if ports[name] is None and name in taken}
+        adapters |= {name: getattr(given, name, None) for name in adapters if adapters[name] is None and name in taken}
     elif not isinstance(given, CompGraphRunner):
         way_out = "Make a runner and run it: runner = CompGraphRunner(cg, hparams); runner.run(...)."
         raise Refused(f"An object of class {type(given).__name__} can't be promoted. {way_out}")
-    return {name: as_written(port) for name, port in ports.items() if port is not None and not is_usual(port)}
+    return {
+        name: as_written(adapter) for name, adapter in adapters.items() if adapter is not None and not is_usual(adapter)
+    }
 
 
 def _check_place(target: Path) -> None:
@@ -123,7 +141,7 @@ def _write(
     draft: Path,
     target: Path,
     given: CompGraphRunner | Pipeline,
-    ports: Mapping[str, Callable[..., Any]],
+    adapters: Mapping[str, Callable[..., Any]],
     outputs: Sequence[str] | None,
     samples: Iterable[Any],
 ) -> None:
@@ -135,25 +153,26 @@ def _write(
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
-    hyperparameters, stored = store_arrays(runner.hyperparameters)
+    hyperparameters, stored = store_hyperparameters(runner.hyperparameters, MOST_NUMBERS)
     free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
     pipeline = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None
     settings = Settings(
         target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
-        own=(*ports, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
+        own=(*adapters, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
     )  # fmt: skip
     reasons = [*_unready(runner, wanted), *unwritable(hyperparameters), *unwritable(attributes, "Attribute")]
-    module, arrays, refusals = write_module(cg, settings, ports, pipeline)
+    module, arrays, refusals = write_module(cg, settings, adapters, pipeline)
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
     runs = [*_runs(runner, samples)]
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
-    write_arrays(draft, {**arrays, **stored})
+    arrays.write(draft)
+    stored.write(draft)
     for number, run in enumerate(runs):
-        _record(draft / SAMPLES / f"{number:03}.npz", run, settings, ports.get("f_out"))
+        _record(draft / SAMPLES / f"{number:03}.npz", run, settings, adapters.get("f_out"))
 
 
 def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:
@@ -203,3 +222,192 @@ def _replace(draft: Path, target: Path) -> None:
         swap_folders(draft, target)  # the old one is then in the scratch folder, and goes with it
     else:
         draft.rename(target)
+
+
+# -- drafts ------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def draft_folder(target: Path) -> Iterator[Path]:
+    """Give the path of a draft beside its target, where the two can be swapped; it is deleted in the end.
+
+    A process that was killed leaves its draft there. The next one to the same target deletes it, once its own is done:
+    a folder in use is locked, and the lock ends with the process.
+    """
+    prefix = f".{target.name[:40]}-"
+    with tempfile.TemporaryDirectory(prefix=prefix, suffix=_DRAFTS, dir=target.parent) as scratch, _locked(scratch):
+        yield Path(scratch) / target.name
+        for folder in target.parent.glob(f".*{_DRAFTS}"):
+            # What another process has not locked yet is empty.
+            if folder.name.startswith(prefix) and any(folder.iterdir()):
+                with _locked(folder) as is_ours:
+                    if is_ours:
+                        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: str | Path) -> Iterator[bool]:
+    """Lock a folder until this process ends, at the latest; give whether that was possible."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_locked = True
+    except OSError:  # another process has it, or the file system has no locks
+        is_locked = False
+    try:
+        yield is_locked
+    finally:
+        os.close(descriptor)
+
+
+def swap_folders(left: Path, right: Path) -> None:
+    """Exchange two folders in one step, which Python has no call for; rename by rename where the system has none."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    in_one = getattr(libc, "renameat2", None)
+    if in_one and in_one(_AT_FDCWD, os.fsencode(left), _AT_FDCWD, os.fsencode(right), _RENAME_EXCHANGE) == 0:
+        return
+    aside = left.with_name("old")
+    right.rename(aside)
+    try:
+        left.rename(right)
+    except OSError:
+        aside.rename(right)
+        raise
+    aside.rename(left)
+
+
+# -- notebook files ----------------------------------------------------------------------------------------------------
+
+
+def promote_notebook(
+    notebook: str | Path,
+    name: str,
+    to: str | Path,
+    outputs: Sequence[str] | None = None,
+    on_cell: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: Callable[[str], None] = lambda text: None,
+    samples: Sequence[str] = (),
+) -> None:
+    """Execute every cell of a notebook in a new kernel of this Python, then promote one of its objects there.
+
+    Parameters
+    ----------
+    notebook
+        An ``.ipynb`` file; it is not changed.
+    name
+        The variable that holds the runner or pipeline.
+    to, outputs
+        As for ``promote``.
+    on_cell
+        Called with the number of code cells done and their total.
+    on_progress
+        Called with what the promotion in the kernel is doing.
+    samples
+        The variables that hold further payloads, as ``promote`` takes them, or lists of such.
+
+    Raises
+    ------
+    BundleError
+        The file can't be read, or a cell raises; the cell is named.
+    PromotionRefused
+        The graph can't be promoted, or there is no such variable.
+    """
+    given = name, str(Path(to).resolve()), None if outputs is None else list(outputs), list(samples)
+    last_cell = f"from epypes.bundle.promote import promote_here as _promote_here\n_promote_here{given!r}"
+    reasons: list[str] = []
+
+    def on_message(message: Mapping[str, Any]) -> None:
+        if "progress" in message:
+            on_progress(message["progress"])
+        reasons.extend(message.get("reasons", ()))
+
+    _execute_notebook(Path(notebook), last_cell, on_cell, on_message)
+    if reasons:
+        raise PromotionRefused(to, reasons)
+
+
+def _execute_notebook(
+    path: Path,
+    last_cell: str,
+    on_cell: Callable[[int, int], None],
+    on_message: Callable[[Mapping[str, Any]], None],
+) -> None:
+    """Execute a notebook and one cell more, and pass on what is displayed with our media type."""
+    with optional_import():
+        import nbformat
+        from nbclient import NotebookClient
+        from nbclient.exceptions import CellExecutionError, DeadKernelError
+
+    class Client(NotebookClient):  # type: ignore[misc]
+        def process_message(self, msg: dict[str, Any], cell: Any, cell_index: int) -> Any:
+            if _MEDIA_TYPE in msg["content"].get("data", ()):
+                on_message(msg["content"]["data"][_MEDIA_TYPE])
+            return super().process_message(msg, cell, cell_index)
+
+    try:
+        document = nbformat.read(path, as_version=4)
+    except OSError as error:
+        text = f"Notebook {path} can't be read: {error.strerror or error}. Name an .ipynb file that is there."
+        raise BundleError(path, text) from error
+    except Exception as error:  # nbformat raises its own and json's errors for what is no notebook
+        reason = f"{type(error).__name__}: {error}".replace("\n", " ")[:120]
+        text = f"{path} is not a notebook that Jupyter opens ({reason}). Name an .ipynb file that it does."
+        raise BundleError(path, text) from error
+    total = sum(cell.cell_type == "code" for cell in document.cells)
+    document.cells.append(nbformat.v4.new_code_cell(last_cell))
+    done = 0
+
+    def cell_executed(cell: Any, cell_index: int, **_: Any) -> None:
+        nonlocal done
+        done += 1
+        on_cell(min(done, total), total)
+
+    with tempfile.TemporaryDirectory(prefix="epypes-promote-") as scratch:
+        client = Client(
+            document,
+            timeout=None,
+            kernel_name="python3",
+            resources={"metadata": {"path": str(path.resolve().parent)}},
+            on_cell_executed=cell_executed,
+        )
+        # Sockets in a folder of this user: over TCP others on the machine could listen.
+        client.config.KernelManager.transport = "ipc"
+        client.config.KernelManager.ip = str(Path(scratch) / "kernel")
+        try:
+            client.execute()
+        except CellExecutionError as error:
+            text = f"{path}: code cell {done} of {total} raised {error.ename}: {error.evalue}"
+            way_out = "Change it so that all cells run from top to bottom."
+            raise BundleError(path, f"{text.rstrip('.')}. {way_out}") from error
+        except DeadKernelError as error:
+            text = f"{path}: the kernel died in code cell {done + 1} of {total}. Run that cell in Jupyter to see why."
+            raise BundleError(path, text) from error
+
+
+def promote_here(name: str, to: str, outputs: Sequence[str] | None, samples: Sequence[str]) -> None:
+    """Promote a variable of the notebook that this kernel runs; display the progress and the reasons against it."""
+    from IPython.display import display
+
+    def send(**message: Any) -> None:
+        display({_MEDIA_TYPE: message}, raw=True)
+
+    names = vars(sys.modules["__main__"])
+    try:
+        if name not in names:
+            known = [key for key, value in names.items() if isinstance(value, CompGraphRunner | Pipeline)]
+            raise UnknownName("variable", name, known, "that holds a runner or pipeline in the notebook")
+        payloads = _payloads(names, samples)
+        promote(names[name], to, outputs, samples=payloads, on_progress=lambda text: send(progress=text))
+    except EpypesError as error:
+        send(reasons=list(error.reasons) if isinstance(error, PromotionRefused) else [str(error)])
+
+
+def _payloads(names: Mapping[str, Any], variables: Sequence[str]) -> list[Any]:
+    """Return the payloads that variables hold: one, or those of a list or tuple."""
+    found: list[Any] = []
+    for name in variables:
+        if name not in names:
+            known = [key for key, value in names.items() if not key.startswith("_") and not callable(value)]
+            raise UnknownName("variable", name, known, "that holds a payload in the notebook")
+        found += names[name] if isinstance(names[name], list | tuple) else [names[name]]
+    return found

@@ -22,9 +22,9 @@ from urllib.parse import unquote, urlsplit
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
+from epypes.bundle.manifest import REQUIREMENTS
 from epypes.errors import BundleError
 
-REQUIREMENTS: Final = "requirements.txt"
 INSTALL_TIMEOUT_S: Final = 1200.0
 _OURS: Final = "epypes"
 # What EPypes needs to read samples; the rest of what it needs is for serving.

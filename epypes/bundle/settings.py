@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import enum
 import math
-import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
+from epypes.bundle.arrays import StoredArray
 from epypes.bundle.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
@@ -30,7 +30,6 @@ from epypes.run.guard import is_plain_array
 # What a person still reads, and a line of a diff still shows.
 MOST_NUMBERS: Final = 400
 FORMAT: Final = 1
-_ARRAYS: Final = "hyperparameters"
 _KIND: Final = "kind"
 _SMALL: Final = range(-(2**63), 2**63)
 _LINE: Final = 100
@@ -119,7 +118,7 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
     last = "unfreeze it and pass it to run()" if what == "Hyperparameter" else "leave it out"
     for token, value in values.items():
         try:
-            written(value)
+            encode_value(value)
         except Unwritable as error:
             reasons.append(f"{what} {token!r} {error.reason}; or {last}.")
     return reasons
@@ -153,7 +152,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
                 takers = ", ".join(cg.digraph.consumers.get(name, ()))
                 tables.add(name, _table(_entry_of(cg, name, value), f"Taken by {takers}."))
             else:
-                tables.add(name, _table(written(value)))
+                tables.add(name, _table(encode_value(value)))
         if tables:
             document.add(section, tables)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
@@ -184,7 +183,7 @@ def _table(entries: Mapping[str, Any], comment: str = "") -> Any:
 
 def _entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
     """Return what stands in pipeline.toml of a hyperparameter: its value, and the range that it may take."""
-    entry = written(value)
+    entry = encode_value(value)
     hint = range_of(cg, token, value)
     if not isinstance(hint, Param):
         return entry
@@ -202,12 +201,12 @@ def _entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
 def _is_limit(limit: Any) -> bool:
     """Whether TOML has a limit as a number; it may have no infinite one."""
     number = plain(limit)
-    return type(number) in (int, float) and math.isfinite(number) and _KIND not in written(number)
+    return type(number) in (int, float) and math.isfinite(number) and _KIND not in encode_value(number)
 
 
 def _choice(choice: Any, entry: Mapping[str, Any]) -> Any:
     """Return a choice as it stands in the place of an entry's value; whole if it is of another kind."""
-    own = written(choice)
+    own = encode_value(choice)
     same = all(own.get(key) == entry.get(key) for key in (_KIND, "dtype", "shape", "enum"))
     return own["value"] if (same or _KIND not in own) and "value" in own else own
 
@@ -231,7 +230,8 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         document = tomllib.loads(path.read_text(encoding="utf-8"))
         bundle, ports = document["bundle"], document["ports"]
         if bundle["format"] != FORMAT:
-            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
+            text = f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}. Promote the graph again"
+            raise BundleError(path, f"{text}, or use the EPypes that wrote it.")
         entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),
@@ -250,7 +250,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error
     except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise BundleError(path, f"{path} can't be read: {error}.") from error
+        raise BundleError(path, f"{path} can't be read: {error}. Promote the graph again.") from error
 
 
 def _strings(values: Sequence[Any]) -> tuple[str, ...]:
@@ -262,7 +262,7 @@ def _strings(values: Sequence[Any]) -> tuple[str, ...]:
 
 
 def _values(entries: Mapping[str, Any], enums: Mapping[str, Any] | None) -> dict[str, Any]:
-    return {token: read(entry, enums) for token, entry in entries.items()}
+    return {token: decode_value(entry, enums) for token, entry in entries.items()}
 
 
 # -- values ----------------------------------------------------------------------------------------------------------
@@ -276,51 +276,7 @@ class Member:
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class StoredArray:
-    """An array that is a file of the bundle, known by its name alone where the files are not read."""
-
-    file: str
-
-
-def store_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return values with a StoredArray for each array that is too large for text, and the arrays by file.
-
-    Parameters
-    ----------
-    values
-        Hyperparameters by token.
-    """
-    after, arrays = dict(values), {}
-    for token, value in values.items():
-        if is_plain_array(value) and value.dtype.kind in "biufc" and value.size > MOST_NUMBERS:
-            file = f"{_ARRAYS}/{re.sub(r'[^0-9A-Za-z_]', '_', token)}.npy"
-            while file in arrays:
-                file = f"{file.removesuffix('.npy')}_.npy"
-            after[token], arrays[file] = StoredArray(file), value
-    return after, arrays
-
-
-def load_array(path: Path, mmap_mode: Literal["r"] | None = None) -> Any:
-    """Return an array of a bundle, which can't be written to.
-
-    Raises
-    ------
-    BundleError
-        The file holds no array, or a part of one.
-    """
-    import numpy as np
-
-    try:
-        array = np.load(path, mmap_mode, allow_pickle=False)
-        array.flags.writeable = False
-    except Exception as error:  # a broken header raises errors of many kinds
-        text = f"{path} is no array that NumPy can read: {error}. Promote the graph again."
-        raise BundleError(path, text) from error
-    return array
-
-
-def alike(entry: Mapping[str, Any], value: Any) -> Any:
+def cast_like(entry: Mapping[str, Any], value: Any) -> Any:
     """Return a number as one of the kind that an entry has: NumPy's of its dtype, else Python's own."""
     number = plain(value)
     if entry.get(_KIND) != "numpy" or not isinstance(number, bool | int | float):
@@ -335,7 +291,7 @@ def fits(value: Any) -> bool:
     return not unwritable({"": value})
 
 
-def written(value: Any) -> dict[str, Any]:
+def encode_value(value: Any) -> dict[str, Any]:
     """Return the entry of a value: ``value``, with its ``kind`` and what else that needs where TOML has none like it.
 
     Raises
@@ -344,12 +300,12 @@ def written(value: Any) -> dict[str, Any]:
         There is no entry for a value of this kind, or of this size.
     """
     try:
-        return _written(value)
+        return _encode(value)
     except RecursionError:
         raise Unwritable("nested too deep") from None
 
 
-def _written(value: Any) -> dict[str, Any]:
+def _encode(value: Any) -> dict[str, Any]:
     kind = type(value)
     if value is None:
         return {_KIND: "none"}
@@ -366,10 +322,10 @@ def _written(value: Any) -> dict[str, Any]:
     for name, (python_type, write, _) in _KINDS.items():
         if kind is python_type:
             return {"value": write(value), _KIND: name}
-    return _written_by_name(value)
+    return _encode_by_name(value)
 
 
-def _written_by_name(value: Any) -> dict[str, Any]:
+def _encode_by_name(value: Any) -> dict[str, Any]:
     """Return the entry of a value that names its dtype, its enumeration or its file."""
     numpy = sys.modules.get("numpy")
     if is_plain_array(value):
@@ -401,7 +357,7 @@ def _array(array: Any) -> dict[str, Any]:
     dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
     entry = {"value": numbers.reshape(array.shape).tolist(), _KIND: "array", "dtype": dtype}
     entry |= {} if array.size else {"shape": list(array.shape)}
-    if read(entry).tobytes() != array.tobytes():
+    if decode_value(entry).tobytes() != array.tobytes():
         raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
     return entry
 
@@ -417,7 +373,7 @@ def _of_number(number: Any) -> Any:
 
 def _part(value: Any) -> Any:
     """Return a value as it stands inside a list or table."""
-    entry = _written(value)
+    entry = _encode(value)
     return entry if _KIND in entry else entry["value"]
 
 
@@ -441,13 +397,13 @@ _KINDS: Final[Mapping[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any
 }
 
 
-def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
+def decode_value(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
     """Return the value of an entry.
 
     Parameters
     ----------
     entry
-        What :func:`written` returned; other keys are passed over.
+        What :func:`encode_value` returned; other keys are passed over.
     enums
         The enumerations by name. Members of others are read as :class:`Member`.
 
@@ -476,11 +432,9 @@ def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> An
     if kind == "enum":
         name = entry["enum"]
         return enums[name][value] if enums and name in enums else Member(name, value)
-    if kind != "file":
-        raise TypeError(f"no value has the kind {kind!r}")
-    if not isinstance(value, str) or not re.fullmatch(rf"{_ARRAYS}/\w+\.npy", value):
-        raise TypeError(f"{value!r} is no file of {_ARRAYS}/")
-    return StoredArray(value)
+    if kind == "file":
+        return StoredArray(value)
+    raise TypeError(f"no value has the kind {kind!r}")
 
 
 def _of_numpy(kind: str, value: Any, entry: Mapping[str, Any]) -> Any:
@@ -497,7 +451,7 @@ def _whole(part: Any, enums: Mapping[str, Any] | None) -> Any:
     """Return a value that stands inside a list or table."""
     if isinstance(part, dict):
         if _KIND in part:
-            return read(part, enums)
+            return decode_value(part, enums)
         return {key: _whole(item, enums) for key, item in part.items()}
     return [_whole(item, enums) for item in part] if isinstance(part, list) else part
 

@@ -1,12 +1,14 @@
 """Static checks that name the line: writes to state that outlives a call, monkeypatches, and what only a notebook has.
 
-What syntax can't see is found by the replays, and by the snapshot that guards the functions of a loaded bundle.
+What syntax can't see is found by the replays, by the comparison of libraries with those of a fresh process, and by the
+snapshot that guards the functions of a loaded bundle.
 """
 
 from __future__ import annotations
 
 import ast
 import builtins
+import inspect
 import sys
 import types
 from collections import deque
@@ -14,16 +16,21 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
-from epypes.bundle.notebook_source import (
+from epypes.bundle.references import global_names, namespace_of
+from epypes.bundle.resolve import (
+    Definition,
+    Refused,
     definition_of,
+    evaluated,
     executed_cells,
-    names_from_outside,
-    nested_codes,
+    is_of_notebook,
     parsed,
     place_in,
 )
-from epypes.bundle.resolve import Definition, Refused, captured_by, evaluated, is_of_notebook
 from epypes.run.guard import is_plain_array
+
+# By module or class of a library and the name there: the place in the notebook that changes it.
+Patches = Mapping[tuple[Any, str], str]
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
 
@@ -45,7 +52,7 @@ def check_state(found: Definition) -> None:
         for function in (evaluated(called, found.names), wrapper):
             node = definition_of(function.__code__)[1] if is_of_notebook(function) else None
             if node is not None:
-                _check_writes(node, function.__code__.co_filename, function, f"{what} {node.name!r}")
+                _check_writes(node, function.__code__.co_filename, function, f"{what} {function.__code__.co_name!r}")
     _check_writes(found.node, found.file, found.function, found.what)
 
 
@@ -53,9 +60,8 @@ def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None,
     """Refuse writes to names and objects from outside of a function; of a class, to global names alone."""
     outside, names = set[str](), dict[str, Any]()
     if function is not None:
-        names = {**function.__globals__, **captured_by(function)}
-        codes = nested_codes(function.__code__)
-        outside = {*function.__code__.co_freevars, *(name for code in codes for name in names_from_outside(code))}
+        names = namespace_of(function)
+        outside = {*function.__code__.co_freevars, *global_names(function.__code__)}
     parts = [*ast.walk(node)]
     stored = {part.id: part for part in parts if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load)}
     for part in parts:
@@ -109,7 +115,7 @@ def _root(node: ast.expr) -> str:
 
 # -- what only a notebook has ----------------------------------------------------------------------------------------
 
-_ASKED: Final = {
+_NAMES_OF_NOTEBOOKS: Final = {
     "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
     "display": "which shows something in the notebook; a service shows nothing. Return it as a token",
     "input": "which asks a person. Make the answer a token",
@@ -121,24 +127,45 @@ _ASKED: Final = {
     "Out": "what the notebook's cells have shown. Make the value a token",
     "eval": "which may use any name. Write what it evaluates",
     "exec": "which may use any name. Write what it runs",
+    "__import__": "which imports what no statement says. Write an import statement",
 } | dict.fromkeys(
     ("__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"),
     "which is another one in a bundle. Write the value itself, or make it a token",
 )
 
 
-def check_asked(name: str, found: Definition) -> None:
+def check_notebook_name(name: str, found: Definition) -> None:
     """Refuse a name that means something in a notebook alone."""
-    if name in _ASKED and not is_of_notebook(found.names.get(name)):
-        raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")
+    if name in _NAMES_OF_NOTEBOOKS and not is_of_notebook(found.names.get(name)):
+        raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_NAMES_OF_NOTEBOOKS[name]}.")
+
+
+# By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
+_REFLECTING: Final = (builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack)
+_REFLECTING_ATTRIBUTES: Final = frozenset(
+    {"__globals__", "__builtins__", "f_globals", "f_locals", "f_builtins", "f_back"}
+)
+
+
+def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that reads the notebook's names otherwise than by name."""
+    for node in ast.walk(found.node):
+        for read in (node, *_attribute_of(node, "getattr")):
+            value = evaluated(read, names) if isinstance(read, ast.Name | ast.Attribute) else None
+            is_main = isinstance(read, ast.Constant) and read.value == "__main__"
+            is_reflecting = any(value is one for one in _REFLECTING)
+            if is_main or is_reflecting or getattr(read, "attr", "") in _REFLECTING_ATTRIBUTES:
+                text = f"{found.what} uses {ast.unparse(read)!r} ({found.place_in(node)}), by which it reaches"
+                raise Refused(f"{text} what no name in it says. Use what you need by its name, or make it a token.")
 
 
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
 
-def check_patches(found: Definition) -> None:
+def check_patches(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
-    known, names = _patches(), {**sys.modules, **found.names, **_imported_by(found)}
+    names = {**sys.modules, **found.names, **_imported_by(found)}
+    _check_reflection(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
@@ -156,10 +183,10 @@ def check_patches(found: Definition) -> None:
             raise _patched(found.what, name if owner is builtins else f"{owner.__name__}.{name}", place)
 
 
-def check_home(module: str, qualname: str, what: str) -> None:
+def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
     """Refuse an object that can be imported only as the notebook has changed it."""
     name = qualname.partition(".")[0]
-    place = _place_of_patch(_patches(), sys.modules[module], name, "by a name that no text has")
+    place = _place_of_patch(known, sys.modules[module], name, "by a name that no text has")
     if place:
         raise _patched(what, f"{module}.{qualname}", place)
 
@@ -182,7 +209,7 @@ def _imported_by(found: Definition) -> dict[str, Any]:
     return names
 
 
-def _place_of_patch(known: Mapping[tuple[Any, str], str], owner: Any, name: str, otherwise: str) -> str:
+def _place_of_patch(known: Patches, owner: Any, name: str, otherwise: str) -> str:
     """Return where the notebook has changed what a module or class has; "" if it has not, ``otherwise`` if unknown."""
     return known.get((owner, name), "") or (otherwise if _is_patched(owner, name) else "")
 
@@ -195,7 +222,7 @@ def _is_patched(owner: Any, name: str) -> bool:
     return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
 
 
-def _patches() -> dict[tuple[Any, str], str]:
+def patches_in_notebook() -> Patches:
     """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
     names, found = vars(sys.modules["__main__"]), dict[tuple[Any, str], str]()
     script = str(names.get("__file__") or "")
@@ -205,7 +232,8 @@ def _patches() -> dict[tuple[Any, str], str]:
             while isinstance(node, ast.Attribute | ast.Subscript):
                 owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
-                if isinstance(node, ast.Attribute) and (is_of_library or isinstance(owner, types.ModuleType)):
+                is_of_library |= isinstance(owner, types.ModuleType)
+                if isinstance(node, ast.Attribute) and node.attr and is_of_library:
                     place = f"cell [{cell}]" if cell else script
                     found[owner, node.attr] = f"{place}, line {written.lineno}"
                     break
@@ -229,3 +257,30 @@ def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str
                 yield evaluated(read.value, names), read.attr
             elif isinstance(read, ast.Name):
                 yield builtins, read.id
+
+
+def place_of_change(name: str, *, is_call: bool = False) -> str:
+    """Return the last place in the cells that may have changed an attribute of a library, by its name; "" if none.
+
+    That is an assignment to it, or a text or keyword that names it; or a call of it if ``is_call``.
+    """
+    last, found = name.rpartition(".")[2], ""
+    script = str(vars(sys.modules["__main__"]).get("__file__") or "")
+    for cell, text in executed_cells(vars(sys.modules["__main__"]), script):
+        tree = parsed(text)
+        nodes: list[Any] = [*ast.walk(tree)] if tree else []
+        read = {id(node.slice) for node in nodes if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)}
+        calls = (node for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "getattr")
+        read |= {id(argument) for call in calls for argument in call.args}
+        lines = [node.lineno for node in nodes if id(node) not in read and _may_change(node, last, is_call=is_call)]
+        found = f"{f'cell [{cell}]' if cell else script}, line {lines[-1]}" if lines else found
+    return found
+
+
+def _may_change(node: Any, name: str, *, is_call: bool) -> bool:
+    if is_call:
+        return isinstance(node, ast.Call) and getattr(node.func, "attr", "") == name
+    if isinstance(node, ast.Attribute):
+        return node.attr == name and not isinstance(node.ctx, ast.Load)
+    text = node.arg if isinstance(node, ast.keyword) else getattr(node, "value", None)
+    return isinstance(text, str) and text.rpartition(".")[2] == name

@@ -13,12 +13,13 @@ import re
 import sys
 import tokenize
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, TypeVar
 
+from epypes.bundle.arrays import CONSTANTS, READER, ArrayFiles, is_storable, reader_text
 from epypes.bundle.expressions import (
     LINE,
     UNKNOWN,
@@ -34,27 +35,32 @@ from epypes.bundle.expressions import (
     names_in,
     quoted,
 )
-from epypes.bundle.notebook_source import (
-    LATE_ANNOTATIONS,
-    Position,
-    assignment_of,
-    cell_of,
-    comment_above,
-    names_from_outside,
-    names_of,
-)
 from epypes.bundle.resolve import (
+    LATE_ANNOTATIONS,
     Definition,
     Importable,
+    Position,
     Refused,
     annotated_names,
+    assignment_of,
+    cell_of,
     class_definition,
+    comment_above,
     evaluated,
+    first_line,
     function_definition,
     importable,
+    names_of,
     with_defaults,
 )
-from epypes.bundle.side_effects import CHANGING, check_asked, check_home, check_patches, check_state
+from epypes.bundle.side_effects import (
+    CHANGING,
+    check_home,
+    check_notebook_name,
+    check_patches,
+    check_state,
+    patches_in_notebook,
+)
 from epypes.run.guard import is_plain_array
 
 T = TypeVar("T")
@@ -91,7 +97,7 @@ class Slice:
     read
         What functions read by name: these names are theirs alone.
     arrays
-        The arrays that are stored in files, by name.
+        The arrays that are stored in files.
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
@@ -109,8 +115,7 @@ class Slice:
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
-        self.stores_arrays = stores_arrays
-        self.arrays: dict[str, Any] = {}
+        self.arrays = ArrayFiles(CONSTANTS)
         self.read: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, Constant] = {}
@@ -119,12 +124,14 @@ class Slice:
         self.reads: dict[str, frozenset[str]] = {}
         self.closures: set[str] = set()
         self.refusals: list[str] = []
+        self._stores_arrays = stores_arrays
         self._reserved = reserved
         self._meanings: dict[str, Meaning] = {}
         self._known: dict[int, str] = {}
         self._unfinished: set[str] = set()
         self._makers: dict[tuple[str, str], str] = {}
         self._notebook: Mapping[str, Any] = {}
+        self._patches = patches_in_notebook()
 
     @contextmanager
     def noted_refusals(self) -> Iterator[None]:
@@ -177,7 +184,7 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
-        check_home(home.module, home.qualname, what)
+        check_home(home.module, home.qualname, what, self._patches)
         top = home.qualname.partition(".")[0]
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
@@ -203,6 +210,16 @@ class Slice:
         else:
             self.claim(name, _of_object(sys.modules.get(module)), what)
             self.imports[name, module] = f"import {module} as {name}"
+
+    def store_array(self, array: Any, name: str, what: str) -> str:
+        """Store an array as a file; return the call that reads it, or "" if files can't hold it or there are none."""
+        if not self._stores_arrays or not is_storable(array):
+            return ""
+        if READER not in self.definitions:
+            self.reserve(READER)
+            self.definitions[READER] = reader_text(*(self.module_name(module, what) for module in ("numpy", "pathlib")))
+            self.reads[READER] = frozenset()
+        return f'{READER}("{self.arrays.add(array, name)}")'
 
     # -- functions and classes ---------------------------------------------------------------------------------------
 
@@ -265,13 +282,15 @@ class Slice:
 
     def _write_closure(self, name: str, inner: str, given: Mapping[str, str], found: Definition) -> None:
         """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
-        whole = f"({', '.join(given)}):\n{_text(found, inner, depth=1)}\n    return {inner}\n"
-        qualname = found.function.__code__.co_qualname if found.function else ""
-        around = qualname.rpartition(".<locals>")[0].rpartition(".")[2] or f"make_{inner}"
+        node = found.factory()
+        around = node.name if node is not None else f"make_{inner}"
+        docstring = _docstring(node, found.lines) if node is not None else ""
+        whole = f"({', '.join(given)}):\n{docstring}{_text(found, inner, depth=1)}\n    return {inner}\n"
         if (around, whole) not in self._makers:
             self._makers[around, whole] = factory = identifier_of(around, self.is_taken)
             self.claim(factory, ("closure", whole), found.what)
-            self._write(factory, f"def {factory}{whole}", found, {*given, inner})
+            above = comment_above(found.lines, first_line(node)) if node is not None else []
+            self._write(factory, "\n".join([*above, f"def {factory}{whole}"]), found, {*given, inner})
         arguments = ", ".join(f"{each}={source}" for each, source in given.items())
         self.definitions[name] = f"{name} = {self._makers[around, whole]}({arguments})\n"
         self.positions[name] = _position(found)
@@ -322,9 +341,9 @@ class Slice:
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
         """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
-        check_patches(found)
-        read = dict.fromkeys(each for code in found.codes() for each in names_from_outside(code))
-        self.reads[name] = frozenset(read.keys() - {*own})
+        check_patches(found, self._patches)
+        read = found.reads()
+        self.reads[name] = frozenset(read) - {*own}
         for needed in read:
             if needed not in own:
                 with self.noted_refusals():
@@ -336,7 +355,7 @@ class Slice:
 
     def _add_name(self, name: str, found: Definition, what: str) -> None:
         """Add what one global name of a definition means at the time of promotion."""
-        check_asked(name, found)
+        check_notebook_name(name, found)
         if name not in found.names:
             self._add_builtin(name, found)
             return
@@ -350,7 +369,7 @@ class Slice:
         written = literal_source(value)
         home = importable(value, name) if not written or not is_short(written) else None
         if home is not None and "." not in home.qualname:  # a nested name can't be imported by itself
-            check_home(home.module, home.qualname, what)
+            check_home(home.module, home.qualname, what, self._patches)
             self.claim(name, _of_object(value), what)
             alias = "" if name == home.qualname else f" as {name}"
             self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
@@ -419,6 +438,13 @@ def _text(found: Definition, name: str, depth: int = 0) -> str:
             # Comments and what is in brackets may stand before the margin.
             lines[number] = re.sub(rf"\s{{0,{margin}}}", pad, line, count=1) if line.strip() else "\n"
     return above + "".join(lines[first : node.end_lineno]).rstrip() + "\n"
+
+
+def _docstring(node: ast.FunctionDef, lines: Sequence[str]) -> str:
+    """Return the lines of the docstring of a function at the margin; "" if it has none."""
+    if ast.get_docstring(node, clean=False) is None:
+        return ""
+    return f"    {ast.get_source_segment(''.join(lines), node.body[0])}\n\n"
 
 
 def _lines_in_strings(text: str) -> set[int]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from typing import Any, Final
 
-from epypes.bundle.clone import called_by, is_plain_pipeline
+from epypes.bundle.clone import is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import (
     LINE,
@@ -21,6 +21,7 @@ from epypes.bundle.expressions import (
     names_in,
 )
 from epypes.bundle.module import module_text
+from epypes.bundle.objects import without_nodes
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, Switch, as_switch
@@ -168,7 +169,7 @@ class _Module:
         def pairs(module: Any) -> list[Pair]:
             return [(what, ours, made) for (what, ours, _), made in zip(self.compared, module.references, strict=True)]
 
-        return refusal(f"{text}references = [{sources}]\n", {}, pairs)
+        return refusal(f"{text}references = [{sources}]\n", pairs)
 
 
 def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dict[str, Region], list[str]]:
@@ -250,7 +251,7 @@ class _Function:
 
     def _call(self, name: str) -> str:
         """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
-        module, function = self.module, called_by(self.cg.functions[name])
+        module, function = self.module, without_nodes(self.cg.functions[name])
         if not is_plain_pipeline(function):
             return module.expression(f"Function {name!r}{self.where}", function, _NO_EXPRESSION, name)
         if id(function) not in module.pipelines:

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.determinism import prove
-from epypes.bundle.draft import draft_folder, swap_folders
-from epypes.bundle.load import SETTINGS
-from epypes.bundle.manifest import check_manifest, digest
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
-from epypes.bundle.settings import Unwritable, alike, read, written
+from epypes.bundle.manifest import SETTINGS, check_manifest, digest
+from epypes.bundle.promote import draft_folder, swap_folders
+from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated
+from epypes.bundle.settings import MOST_NUMBERS, Unwritable, cast_like, decode_value, encode_value
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
 
@@ -107,13 +106,13 @@ def changed_settings(text: str, values: Mapping[str, Any]) -> str:
             raise UnknownName("hyperparameter", token, entries, "in this bundle")
         entry = entries[token]
         try:
-            new = written(alike(entry, value))
+            new = encode_value(cast_like(entry, value))
         except Unwritable as error:
-            kind = type(value).__name__
-            text = f"Hyperparameter {token!r} can't be a {kind}: {SETTINGS} can't hold one."
-            raise HyperparameterError(token, text) from error
+            text = f"Hyperparameter {token!r} can't be {error}: {SETTINGS} can't hold it. Give a number, a string, an"
+            text += f" array of at most {MOST_NUMBERS} numbers, or tuples, lists and dicts of them; or set"
+            raise HyperparameterError(token, f"{text} the value in the notebook, and promote again.") from error
         # Its range stays.
-        old = written(read(entry.unwrap()))
+        old = encode_value(decode_value(entry.unwrap()))
         for key in old.keys() - new.keys():
             del entry[key]
         for key, part in new.items():

@@ -17,12 +17,13 @@ from epypes.cli.recordings import play, record
 from epypes.cli.services import deploy, rollback, serve, set_parameters, stop
 from epypes.cli.status import status
 
+_COMMANDS = (
+    *(promote, verify, check, serve, call, status, set_parameters, stop, deploy, rollback, failures, replay),
+    *(record, play, keys, doctor, export, lab, demo, experiment),
+)
 app = click.Group(
     "epypes",
+    commands=_COMMANDS,
     help="Vision algorithms as computational graphs: promoted from a notebook, verified, served and called.",
     context_settings={"show_default": True},
 )
-for _command in (promote, verify, check, serve, call, status, set_parameters, stop, deploy, rollback, failures, replay):
-    app.add_command(_command)
-for _command in (record, play, keys, doctor, export, lab, demo, experiment):
-    app.add_command(_command)

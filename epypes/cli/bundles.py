@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from epypes.cli.options import PATH, bundle_argument, json_option
-from epypes.cli.terminal import print_table, progress
+from epypes.cli.terminal import print_table
 from epypes.errors import BundleError, ReplayDiffers, ScaleError
 from epypes.wording import counted, ended
 
@@ -35,20 +36,21 @@ def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: 
 
 
 def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], samples: Sequence[str] = ()) -> None:
-    """Promote with a progress display."""
-    from epypes.bundle.notebook import promote_notebook
+    """Promote with a progress bar."""
+    from epypes.bundle.promote import promote_notebook
 
-    with progress() as shown:
-        task = shown.add_task("executing the notebook", total=None)
+    with click.progressbar(length=1, label="executing the notebook", file=sys.stderr) as bar:
 
         def on_cell(done: int, total: int) -> None:
-            shown.update(task, completed=done, total=total)
+            bar.length = total
+            bar.update(done - bar.pos)
 
         def on_step(text: str) -> None:
-            shown.update(task, description=text)
+            bar.label = text
+            bar.render_progress()
 
         promote_notebook(notebook, name, to, list(outputs) or None, on_cell, on_step, list(samples))
-        shown.update(task, description="promoted")
+        on_step("promoted")
 
 
 @click.command()

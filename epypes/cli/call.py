@@ -54,8 +54,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
 
     A service with several input tokens needs one value for each. An answer without --out is printed.
     """
-    from epypes.bundle.load import SETTINGS
-    from epypes.bundle.manifest import check_manifest
+    from epypes.bundle.manifest import SETTINGS, check_manifest
     from epypes.bundle.settings import read_settings
     from epypes.display.previews.preview import preview
     from epypes.service import Client
@@ -157,7 +156,7 @@ def demo(notebook: Path, to: Path, name: str, output: str) -> None:
     from epypes.acquisition import read_image, write_image
     from epypes.bundle import verify
     from epypes.bundle.compare import first_difference
-    from epypes.bundle.load import SAMPLES, SETTINGS
+    from epypes.bundle.manifest import SAMPLES, SETTINGS
     from epypes.bundle.settings import read_settings
     from epypes.wire.samples import load_sample
 

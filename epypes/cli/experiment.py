@@ -10,22 +10,11 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from epypes.cli.options import PATH, seconds_option
-from epypes.cli.terminal import print_table
 
 if TYPE_CHECKING:
     from epypes.experiment import Results
 
 _MAX_DRAWINGS: Final = 200
-# Python parses no number of 4,300 digits.
-_LONGEST_NUMBER: Final = 100
-# Columns of the printed table, and of the summary.
-_COLUMNS: Final = {
-    "median": "median_ms",
-    "mode": "mode_ms",
-    "least": "least_ms",
-    "most": "most_ms",
-    "paper's mode": "paper_mode_ms",
-}
 
 
 @click.command()
@@ -52,7 +41,7 @@ def experiment(layout: str, workers: int, camera: Sequence[str], to: Path | None
     # Drawing takes the processor from what is measured: it is done between requests, and not often.
     often = {"update_min_steps": max(1, total // _MAX_DRAWINGS), "hidden": not sys.stderr.isatty()}
     with click.progressbar(length=total, label=f"layout {layout}", file=sys.stderr, **often) as bar:
-        cameras = [int(text) if text.isdecimal() and len(text) < _LONGEST_NUMBER else text for text in camera]
+        cameras = [int(text) if text.isdecimal() else text for text in camera]
         results = run_experiment(layout, workers=workers, cameras=cameras, progress=lambda *_: bar.update(1), **options)
     _print_results(results)
     if to is not None:
@@ -64,10 +53,10 @@ def _print_results(results: Results) -> None:
     """Print the summary of the times, then the requests that failed with their reasons."""
     from epypes.experiment.results import summary
 
-    rows = summary(results.table)[list(_COLUMNS.values())].map(lambda value: "" if value != value else f"{value:.3f}")
-    columns: dict[str, dict[str, Any]] = {"time": {}, **{name: {"justify": "right"} for name in _COLUMNS}}
-    title = f"Layout {results.layout}, in milliseconds"
-    print_table(columns, rows.itertuples(name=None), title)
+    times = summary(results.table).drop(columns=["requests", "not_positive"])
+    times.columns = times.columns.str.removesuffix("_ms").str.replace("paper_mode", "paper's mode")
+    shown = times.to_string(float_format="{:.3f}".format, na_rep="")
+    click.echo(f"Layout {results.layout}, in milliseconds\n{shown}")
     failures = results.table["failure"]
     for text, count in failures[failures != ""].value_counts().items():
         click.echo(f"{count} of {len(failures)} requests failed: {text}", err=True)

@@ -44,7 +44,7 @@ replica_option: Final = click.option(
 token_file_option: Final = click.option(
     "--token-file",
     type=PATH,
-    help="File with the service's token; default: EPYPES_TOKEN, or that of a service here.",
+    help="File with the service's access token; default: EPYPES_TOKEN, or that of a service here.",
 )
 insecure_option: Final = click.option("--insecure", is_flag=True, help="Bind addresses that other machines can reach.")
 keys_option: Final = click.option("--keys", type=PATH, help="The .key_secret file of this side; epypes keys makes it.")

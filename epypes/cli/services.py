@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from epypes.service.state_file import ServiceState
 
 _ANY_PORT: Final = "tcp://127.0.0.1:*"
-_DIGITS: Final = 12
+DIGITS: Final = 12
 
 _service_option: Final = click.option(
     "--http",
@@ -99,6 +99,11 @@ def connect_to(source: str, token_file: Path | None, replica: str = "") -> Conne
     except (OSError, UnicodeDecodeError) as error:
         raise KeysError(token_file, f"The token file {token_file} can't be read: {error}.") from error
     return connect(url, token=token)
+
+
+def describe_bundle(service: Mapping[str, Any]) -> str:
+    """Return the bundle of a service, which is given as its info, with the beginning of its digest."""
+    return f"{service['bundle']} ({service['digest'][:DIGITS]})"
 
 
 def describe_failures(address: str, is_shown: bool) -> str:
@@ -179,7 +184,7 @@ def _print_ready(bundle: Path, state: ServiceState) -> None:
         # The token is for the terminal alone: other users may read a log.
         token = Path(state.token_file).read_text(encoding="utf-8").strip() if sys.stdout.isatty() else ""
         page = f"{state.http}/{f'#token={token}' if token else ''}"
-        click.echo(f"Live page: {page} (the token for changes is in {state.token_file})")
+        click.echo(f"Live page: {page} (the access token, for changes, is in {state.token_file})")
 
 
 @click.command()
@@ -279,6 +284,5 @@ def rollback(source: str, token_file: Path | None) -> None:
 
 
 def _print_exchange(verb: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    served, left = (f"{info['bundle']} ({info['digest'][:_DIGITS]})" for info in (now, before))
     changed = "".join(f" {line}." for line in now.get("changed", ()))
-    click.echo(f"{verb} {served} in place of {left}: {now['state']}.{changed}")
+    click.echo(f"{verb} {describe_bundle(now)} in place of {describe_bundle(before)}: {now['state']}.{changed}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from epypes.cli.options import json_option, replica_option, source_argument
-from epypes.cli.services import connect_to, describe_failures, is_url, states_of
+from epypes.cli.services import DIGITS, connect_to, describe_bundle, describe_failures, is_url, states_of
 from epypes.errors import EpypesError
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ _NO_GROUP: Final[dict[str, Any]] = {"members": [], "lost": [], "trouble": ""}
 # The state of a service that can't be asked, since it has no HTTP control.
 _UNKNOWN: Final = "RUNNING"
 _NO_HTTP: Final = "no --http"
-_DIGITS: Final = 12
 
 # A service as JSON: the answer of its HTTP control (`Service.info`, its parameters and its group), or its state file.
 Info = dict[str, Any]
@@ -102,15 +101,11 @@ def _print_service(service: Info) -> None:
     reason = f" ({service['reason']})" if service.get("reason") else ""
     replica = f", replica {service['replica']}" if service.get("replica") else ""
     no_http = "" if service.get("state") else f", {_NO_HTTP}"
-    described = f"{_describe_bundle(service)}{replica}, process {service['pid']}{no_http}"
+    described = f"{describe_bundle(service)}{replica}, process {service['pid']}{no_http}"
     click.echo(f"{service.get('state', _UNKNOWN)}{reason} {described}.")
     if "counts" in service:
         _print_counts(service["counts"])
     _print_parameters_and_addresses(service)
-
-
-def _describe_bundle(service: Info) -> str:
-    return f"{service['bundle']} ({service['digest'][:_DIGITS]})"
 
 
 def _print_counts(counts: dict[str, int]) -> None:
@@ -143,7 +138,7 @@ def _print_group(services: list[Info], *, with_members: bool) -> None:
     if not with_members:
         return
     if not asked:
-        click.echo(f"{_describe_bundle(first)}.")
+        click.echo(f"{describe_bundle(first)}.")
     elif not group["trouble"]:
         _print_counts(group["counts"])
     _print_parameters_and_addresses(first)
@@ -155,11 +150,11 @@ def _print_group(services: list[Info], *, with_members: bool) -> None:
 
 def _describe_group(service: Info, group: dict[str, Any]) -> str:
     if group["trouble"]:
-        return f"Group of {_describe_bundle(service)}: the other replicas are not heard: {group['trouble']}"
+        return f"Group of {describe_bundle(service)}: the other replicas are not heard: {group['trouble']}"
     agree = "all with" if group["agree"] else "not all with"
     lost = f", lost {len(group['lost'])}" if group["lost"] else ""
     counts = f"replicas {group['replicas']}, ready {group['ready']}{lost}"
-    return f"Group: {counts}, {agree} the same bundle and parameters: {_describe_bundle(service)}."
+    return f"Group: {counts}, {agree} the same bundle and parameters: {describe_bundle(service)}."
 
 
 def _merge_members(services: Iterable[Info], group: dict[str, Any]) -> tuple[list[Info], list[Info]]:
@@ -191,7 +186,7 @@ def _describe_member(member: Info, trouble: str, *, with_bundle: bool) -> str:
     if "counts" in member:
         parts += [f"{member['counts'].get('answered', 0)} answered", f"revision {member['revision']}"]
     if with_bundle:
-        parts.append(f"bundle {member.get('name', '')} ({member['digest'][:_DIGITS]})".replace("  ", " "))
+        parts.append(f"bundle {member.get('name', '')} ({member['digest'][:DIGITS]})".replace("  ", " "))
     parts += [member["host"], f"process {member['pid']}"]
     if member["http"] or member["state"] != "SILENT":
         parts.append(member["http"] or _NO_HTTP)

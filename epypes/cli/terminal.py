@@ -1,18 +1,13 @@
-"""Tables and progress displays.
+"""Tables of results, on standard output.
 
-Results go to standard output, progress to standard error, so that a result can be piped. Lines are printed by
-`click.echo`; rich is imported where a table or a progress display is drawn, since its import takes as long as all else.
+Lines are printed by `click.echo`, progress by `click.progressbar` on standard error, so that a result can be piped.
+rich is imported where a table is drawn, since its import takes as long as all else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 
 def print_table(columns: Mapping[str, Mapping[str, Any]], rows: Iterable[Sequence[str]], title: str = "") -> None:
@@ -28,6 +23,7 @@ def print_table(columns: Mapping[str, Mapping[str, Any]], rows: Iterable[Sequenc
         Printed above. A table without a title is as wide as the terminal and has no frame.
     """
     from rich.box import SIMPLE_HEAD
+    from rich.console import Console
     from rich.table import Table
 
     plain: dict[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True, "expand": True}
@@ -39,21 +35,5 @@ def print_table(columns: Mapping[str, Mapping[str, Any]], rows: Iterable[Sequenc
             table.add_row(*row)
         else:
             table.add_section()
-    _console().print(table)
-
-
-@contextmanager
-def progress() -> Iterator[Progress]:
-    """Show a progress display while the block runs."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), console=_console(stderr=True)) as shown:
-        yield shown
-
-
-def _console(*, stderr: bool = False) -> Console:
-    from rich.console import Console
-
     # Printed text may hold anything: a [name] or :name: in it is no markup.
-    return Console(stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False)
+    Console(highlight=False, soft_wrap=True, markup=False, emoji=False).print(table)

@@ -29,7 +29,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from epypes.errors import EpypesError, ExperimentError
-from epypes.experiment.nodes import COMPONENTS, Settings, StereoPair, parse_request
+from epypes.experiment.nodes import COMPONENTS, Settings
 from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 
@@ -41,30 +41,11 @@ _ANSWER_TIMEOUT_S: Final = 3 * _START_TIMEOUT_S
 _STOP_TIMEOUT_S: Final = 5.0
 _PRINTED_CHARACTERS: Final = 100_000
 
-# What the first node of a process takes from its subscriber, and what the last gives to its publisher.
-_FROM_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "acquisition": parse_request,
-    "vision": StereoPair.from_envelope,
-}
-_TO_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {"acquisition": StereoPair.to_envelope, "vision": lambda it: it}
-
-
 # For each process of its own its nodes, in the order in which an event passes them; without such a process, they run in
 # the caller's.
 LAYOUTS: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = MappingProxyType(
     {"paper": (("acquisition", "vision"),), "one": (), "three": (("acquisition",), ("vision",))}
 )
-
-
-class ConvertingQueue:
-    """The putting end of a queue, which turns every item into something else."""
-
-    def __init__(self, queue: Any, convert: Callable[[Any], Any]) -> None:
-        self._queue, self._convert = queue, convert
-
-    def put(self, item: Any, block: bool = True) -> None:
-        """Convert an item, and put it on the queue."""
-        self._queue.put(self._convert(item), block=block)
 
 
 class Station:
@@ -82,12 +63,10 @@ class Station:
 
     def __init__(self, names: Sequence[str], settings: Settings, scheme: str) -> None:
         self._scheme, self._running = scheme, contextlib.ExitStack()
-        q_in: Any = queue.SimpleQueue()
+        self._q_in: Any = queue.SimpleQueue()
         # Mailboxes, whose items are sent by the thread that puts them: no other one has to wake up for that.
         self._q_out, self._q_failures = Mailbox("drop_oldest", _QUEUE_SIZE), Mailbox("drop_oldest", _QUEUE_SIZE)
-        last = ConvertingQueue(self._q_out, _TO_SOCKET[names[-1]])
-        queues = [q_in, *(queue.SimpleQueue() for _ in names[1:]), last]
-        self._events = ConvertingQueue(q_in, _FROM_SOCKET[names[0]])
+        queues = [self._q_in, *(queue.SimpleQueue() for _ in names[1:]), self._q_out]
         self.nodes = [COMPONENTS[name](queues[i], queues[i + 1], settings) for i, name in enumerate(names)]
         for node in self.nodes:
             node.on_error = self._q_failures.put
@@ -110,7 +89,7 @@ class Station:
         for node in self.nodes:
             if not node.wait_until_ready(_START_TIMEOUT_S):
                 raise ExperimentError(node.name, f"The {node.name} node has no images after {_START_TIMEOUT_S:g} s.")
-        subscriber = enter(ZMQSubscriber(source, self._events))
+        subscriber = enter(ZMQSubscriber(source, self._q_in))
         if not subscriber.wait_joined(_START_TIMEOUT_S):
             raise ExperimentError(self.nodes[0].name, f"Nothing is published at {source}.")
         return {"answers": answers.address, "failures": failures.address}

@@ -1,16 +1,17 @@
 """The two nodes that answer a request, and their messages: acquisition finds the images, vision finds the keypoints.
 
 They are the same in every layout, and know nothing of sockets. Requests and answers are messages of 2019: an Event, a
-JustBytes. A pair of images is a tuple of two arrays in a process, and an Envelope between processes. Attributes are
-doubles, in seconds.
+JustBytes. A pair of images is an Envelope. Attributes are doubles, in seconds.
 """
 
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, Final, Self
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from time import perf_counter_ns
+from typing import Any, Final
 
 import numpy as np
 
@@ -59,14 +60,6 @@ class Settings:
 # -- messages --------------------------------------------------------------------------------------------------------
 
 
-def parse_request(data: bytes) -> Event | bytes:
-    """Return the Event in some bytes, or the bytes if they are none: `time_of_request` refuses them, in f_in."""
-    try:
-        return parsed(Event, data)
-    except MessageError:
-        return data
-
-
 def time_of_request(request: Event | bytes) -> float:
     """Return the time whose images a request asks for: Unix time in seconds.
 
@@ -81,46 +74,26 @@ def time_of_request(request: Event | bytes) -> float:
     return found
 
 
-class StereoPair(tuple[Any, ...]):
-    """A tuple of two images, with the id of the request that it answers, and attributes, which may be added to."""
+def images_of(message: Any) -> dict[str, Any]:
+    """Return the two images of a message from acquisition, by token of the vision graph.
 
-    id: str
-    attributes: dict[str, float]
+    Raises
+    ------
+    MessageError
+        Of reason ``"no pair"`` if it is something else.
+    """
+    if not isinstance(message, Envelope) or message.type != PAIR or message.parts.keys() != {*_IMAGES}:
+        raise MessageError("no pair", f"Vision takes pairs of images, not {message!r:.200}.")
+    return dict(message.parts)
 
-    def __new__(cls, images: Iterable[Any], request_id: str, attributes: Mapping[str, float]) -> Self:
-        """Make a pair of two images.
 
-        Raises
-        ------
-        ValueError
-            There are not two.
-        """
-        pair = super().__new__(cls, images)
-        if len(pair) != len(_IMAGES):
-            raise ValueError(f"A stereo pair has two images, not {len(pair)}. Give two cameras.")
-        pair.id, pair.attributes = request_id, dict(attributes)
-        return pair
-
-    @classmethod
-    def from_envelope(cls, envelope: Any) -> Self:
-        """Return the pair that another process has sent.
-
-        Raises
-        ------
-        MessageError
-            Of reason ``"no pair"`` if it is something else.
-        """
-        if not isinstance(envelope, Envelope) or envelope.type != PAIR or not envelope.parts.keys() >= {*_IMAGES}:
-            raise MessageError("no pair", f"Vision takes pairs of images, not {envelope!r:.200}.")
-        return cls((envelope.parts[name] for name in _IMAGES), envelope.id, envelope.attributes)
-
-    def to_envelope(self) -> Envelope:
-        """Return the message that carries the pair to another process."""
-        parts = dict(zip(_IMAGES, self, strict=True))
-        return Envelope(type=PAIR, parts=parts, id=self.id, source="acquisition", attributes=self.attributes)
-
-    def __repr__(self) -> str:
-        return f"<StereoPair {self.id:.40}: {len(self.attributes)} attributes>"
+def with_attributes(message: Any, values: Mapping[str, Any]) -> Any:
+    """Return a message with more attributes: another Envelope, or the same JustBytes."""
+    if isinstance(message, Envelope):
+        return replace(message, attributes={**message.attributes, **values})
+    for key, value in values.items():
+        add_attribute(message, key, value)
+    return message
 
 
 def encode_keypoints(keypoints: Array, *, unsafe_pickle: bool = False) -> bytes:
@@ -176,45 +149,32 @@ class Component(FullPipeline):
     ----------
     f_in
         Called with an event; returns its payload.
-    pack
-        Called with the view of an event; returns the answer without its times: a StereoPair or a JustBytes.
+    f_out
+        Called with the view of an event; returns the answer without its times: an Envelope or a JustBytes.
 
     The other parameters are those of FullPipeline.
     """
 
-    def __init__(self, name: str, cg: CompGraph, q_in: Any, q_out: Any, f_in: Any, pack: Any, **options: Any) -> None:
-        super().__init__(name, cg, q_in, q_out, f_in, self.answer, **options)
-        self._pack: Callable[[EventView], Any] = pack
-
-    def answer(self, view: EventView) -> Any:
-        """Return the answer with the times so far: the f_out."""
-        answer, stamps = self._pack(view), view.stamps
-        # t_p and o_cg are the paper's: the pipeline's own time as a node, and what its nodes' times leave of it.
-        self._add(answer, "t_react", stamps.react_ns / _NS)
-        self._add(answer, "t_fin_start", stamps.f_in_start_ns / _NS)
-        self._add(answer, "t_fin_end", stamps.f_in_end_ns / _NS)
-        self._add(answer, "t_p", self.time)
-        self._add(answer, "o_cg", self.compute_overhead())
-        self._add(answer, "t_fout_start", stamps.f_out_start_ns / _NS)
-        return answer
-
     def put(self, answer: Any, view: EventView) -> None:
-        """Add the end of f_out and the time of publishing to an answer, then put it on q_out."""
-        t_pub = view.stamps.now_ns() / _NS
-        self._add(answer, "t_fout_end", view.stamps.f_out_end_ns / _NS)
-        self._add(answer, "t_pub", t_pub)
-        super().put(answer, view)
+        """Put an answer with its times on q_out."""
+        # Read before anything else: to write the times is no part of them.
+        put_ns, stamps = perf_counter_ns(), view.stamps
+        times_ns = {
+            "t_pub": stamps.f_out_end_ns + put_ns - stamps.f_out_end,
+            "t_react": stamps.react_ns,
+            "t_fin_start": stamps.f_in_start_ns,
+            "t_fin_end": stamps.f_in_end_ns,
+            "t_fout_start": stamps.f_out_start_ns,
+            "t_fout_end": stamps.f_out_end_ns,
+        }
+        # t_p and o_cg are the paper's: the pipeline's own time as a node, and what its nodes' times leave of it.
+        times_s = {"t_p": self.time, "o_cg": self.compute_overhead()}
+        times_s |= {name: time_ns / _NS for name, time_ns in times_ns.items()}
+        super().put(with_attributes(answer, {f"{self.name}.{name}": time for name, time in times_s.items()}), view)
 
     def wait_until_ready(self, timeout_s: float) -> bool:
         """Return whether it can answer, within ``timeout_s`` seconds of being started."""
         return True
-
-    def _add(self, answer: Any, time: str, value: float) -> None:
-        key = f"{self.name}.{time}"
-        if isinstance(answer, StereoPair):
-            answer.attributes[key] = value
-        else:
-            add_attribute(answer, key, value)
 
 
 class Acquisition(Component):
@@ -231,14 +191,24 @@ class Acquisition(Component):
         def nearest(t_vreq: float) -> tuple[Any, ...]:
             return tuple(frame.image for frame in self.cameras.nearest(round(t_vreq * _NS)))
 
+        def pair(view: EventView) -> Envelope:
+            parts = {name: view[name] for name in _IMAGES}
+            return Envelope(PAIR, parts, view.event.id, source=self.name, attributes={T_VREQ: view[T_VREQ]})
+
         super().__init__(
             "acquisition",
-            CompGraph({"nearest": nearest}, {"nearest": (T_VREQ, "pair")}),
+            CompGraph({"nearest": nearest}, {"nearest": (T_VREQ, _IMAGES)}),
             q_in,
             q_out,
             lambda request: {T_VREQ: time_of_request(request)},
-            lambda view: StereoPair(view["pair"], view.event.id, {T_VREQ: view[T_VREQ]}),
+            pair,
         )
+
+    def handle(self, event: Any) -> None:
+        """Answer a request, which comes as bytes; a failure has its id, and f_in refuses what is no request."""
+        with suppress(MessageError):
+            event = parsed(Event, event)
+        super().handle(event)
 
     def listen(self, timeout_s: float = 0.5) -> None:
         """Start the cameras and the event loop."""
@@ -265,20 +235,17 @@ class Vision(Component):
     """The component that runs the ORB graph on pairs, and answers with the first 20 rows of matched keypoints."""
 
     def __init__(self, q_in: Any, q_out: Any, settings: Settings) -> None:
-        def pack(view: EventView) -> JustBytes:
+        def answer(view: EventView) -> Any:
             contents = encode_keypoints(view["keypoints_paired"][:_ROWS], unsafe_pickle=settings.unsafe_pickle)
-            answer = JustBytes(contents=contents, id=view.event.id)
-            for key, value in view.event.attributes.items():
-                add_attribute(answer, key, value)
-            return answer
+            return with_attributes(JustBytes(contents=contents, id=view.event.id), view.event.attributes)
 
         super().__init__(
             "vision",
             orb_graph(),
             q_in,
             q_out,
-            lambda pair: dict(zip(_IMAGES, pair, strict=True)),
-            pack,
+            images_of,
+            answer,
             hparams=orb_hyperparameters(),
             workers=settings.workers,
         )

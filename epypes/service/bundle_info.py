@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.load import SETTINGS
-from epypes.bundle.manifest import check_manifest
+from epypes.bundle.manifest import SETTINGS, check_manifest
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.service.parameters import entries_of

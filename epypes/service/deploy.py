@@ -95,14 +95,14 @@ class Deployer:
         return self._exclusive(self._supervisor.bundle.path, lambda: self._write_back(dry_run))
 
     def _write_back(self, dry_run: bool) -> WriteBack:
-        from epypes.bundle.settings import read
+        from epypes.bundle.settings import decode_value
         from epypes.bundle.writeback import write_back
 
         before = self._supervisor.bundle
         if check_manifest(before.path) != before.digest:
             text = f"{before.path} is not the bundle any more that is served. Deploy it first, or restore it."
             raise BundleError(before.path, text)
-        values = {token: read(entry) for token, entry in self._parameters.current.entries.items()}
+        values = {token: decode_value(entry) for token, entry in self._parameters.current.entries.items()}
         self._supervisor.is_rewritten = not dry_run
         try:
             found = write_back(before.path, values, dry_run=dry_run)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.bundle.settings import written
+from epypes.bundle.settings import encode_value
 from epypes.errors import ParametersRefused, RevisionConflict, ServiceError, UnknownName
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def _with_value(entries: Entries, token: str, given: Any) -> dict[str, Any]:
         return {**_chosen(token, given, entry), **rest}
     if "value" not in entry:
         # It was None, so its type is not known.
-        return {**written(tuple(given) if isinstance(given, list) else given), **rest}
+        return {**encode_value(tuple(given) if isinstance(given, list) else given), **rest}
     value = _converted(token, given, entry)
     _check_range(token, value, entry)
     return {**value_of(entry), "value": value, **rest}

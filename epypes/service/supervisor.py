@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import Final
 
-from epypes.bundle.replay import REPLAY_TIMEOUT_S
+from epypes.bundle.replay_process import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.bundle_info import BundleInfo
 from epypes.service.dispatcher import Dispatcher

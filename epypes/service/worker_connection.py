@@ -21,7 +21,7 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.bundle.load import MODULE
+from epypes.bundle.manifest import MODULE
 from epypes.errors import MessageError, ServiceError
 from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage, buffers_of
 from epypes.service.packing import BytesLike

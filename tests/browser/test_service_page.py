@@ -199,6 +199,21 @@ def test_a_token_is_seen_larger_by_mouse_and_by_keyboard(browser, served):
         assert not page.complaints
 
 
+def test_a_token_chosen_at_once_after_another_was_closed_is_seen(browser, served):
+    _, http, _ = served
+    with page_of(browser, http) as page:
+        page.locator("#token-edges").click()
+        page.wait_for_selector("#look[open] img")
+        page.evaluate(
+            """() => {
+                document.getElementById('look').close();
+                document.getElementById('token-canny_lo').dispatchEvent(new MouseEvent('click', {bubbles: true}));
+            }"""
+        )
+        page.wait_for_selector("#look[open] pre")
+        assert page.locator("#look-title").text_content() == "canny_lo"
+
+
 def test_parameters_are_applied_all_at_once(browser, served):
     service, http, _ = served
     change(http, canny_lo=70, blur_kernel=11)
@@ -304,7 +319,7 @@ def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_pau
         page.locator("#token").fill("x" * 43)
         page.locator("#token-form button").click()
         page.wait_for_selector("#notice:not([hidden])")
-        assert "not the service's access key" in page.locator("#notice").text_content()
+        assert "not the service's access token" in page.locator("#notice").text_content()
         assert page.locator("#pause").is_disabled()
         page.locator("#token").fill(http.token)
         page.locator("#token-form button").click()

@@ -18,7 +18,7 @@ def slice_graph(functions):
     gathered, written = gather(lambda needed: Graphs(needed).write(cg))
     if not gathered.refusals:
         text = emit_module(Settings("case", ("x",), ("y",), {}), cg, gathered, written)
-        why = refusal(text, {}, lambda made: _pairs(functions, made))
+        why = refusal(text, lambda made: _pairs(functions, made))
         gathered.refusals += [why] if why else []
     return gathered, written
 

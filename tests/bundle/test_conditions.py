@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -162,6 +163,17 @@ def test_changed_print_options_of_numpy_are_noted(tmp_path):
     with np.printoptions(precision=2):
         ep.promote(runner, tmp_path / "bundle", on_progress=notes.append)
     assert any("The notebook has changed numpy.set_printoptions" in note for note in notes)
+
+
+def test_each_number_of_threads_is_varied_from_what_it_is_set_to(tmp_path, monkeypatch):
+    monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        text = refusal("import cv2\ndef use(x):\n    return cv2.getNumThreads()", tmp_path / "bundle")
+    finally:
+        cv2.setNumThreads(before)
+    assert "It depends on the number of threads (OMP_NUM_THREADS, cv2.setNumThreads)" in text
 
 
 def test_lines_that_no_sample_runs_are_named(tmp_path):

@@ -81,6 +81,23 @@ def test_a_relative_path_is_refused_since_the_current_folder_is_another_one_ther
     assert re.search(rf"{found}\. The current folder is another one there", reasons)
 
 
+KEEPERS = {
+    "in the folder of temporary files": "Path(tempfile.gettempdir()) / f'seen-{{os.getpid()}}.bin'",
+    "in the current folder": "Path('seen-{new}.bin')",
+}
+
+
+@pytest.mark.parametrize("where", KEEPERS)
+def test_a_file_by_which_a_function_keeps_something_from_call_to_call_is_refused(where, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source = (
+        f"import os, tempfile\nfrom pathlib import Path\ndef use(image):\n    path = {KEEPERS[where].format(new=1)}\n"
+        "    known = path.read_bytes() if path.exists() else b''\n    path.write_bytes(known[:9] + b'1')\n    return image + 1\n"
+    )
+    reasons = reasons_against(source, tmp_path / "to" / "bundle")
+    assert re.search(r"use\(\) \(pipeline\.py, line \d+\) reads /\S+, which an earlier call has written", reasons)
+
+
 FINE = {
     "its own temporary file": "import tempfile, numpy as np\ndef use(image):\n    with tempfile.TemporaryFile() as file:"
     "\n        np.save(file, image)\n        file.seek(0)\n        return np.load(file)\n",

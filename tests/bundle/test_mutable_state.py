@@ -557,6 +557,41 @@ def test_a_guarded_function_may_run_a_pipeline_of_the_bundle_in_threads(tmp_path
     assert done.wait(60)
 
 
+@pytest.mark.parametrize("workers", ["ThreadPoolExecutor(2)", "POOL"], ids=["a pool per call", "one pool"])
+def test_a_guarded_function_may_run_nodes_and_pipelines_of_the_bundle_in_its_own_thread_pool(workers, tmp_path):
+    source = f"""
+import contextlib
+import epypes as ep
+from concurrent.futures import ThreadPoolExecutor
+POOL = contextlib.nullcontext(ThreadPoolExecutor(2))
+L = [1]
+class Counting(ep.Node):
+    def compute(self, x):
+        self.n = getattr(self, "n", 0) + 1
+        return x + len(L)
+node = Counting("node", abs)
+pipe = ep.Pipeline("pipe", ep.CompGraph({{"inner": lambda x: x + len(L)}}, {{"inner": ("x", "y")}}))
+def f(x):
+    with {workers} as pool:
+        found = [*pool.map(node, [x] * 4), *pool.map(pipe, [x] * 4)]
+    if x > 100: L.append(x)
+    return sum(found)
+func_dict = {{"f": f, "node": node, "pipe": pipe}}
+func_io = {{"f": ("x", "y"), "node": ("x", "z"), "pipe": ("x", "w")}}
+"""
+    runner = ep.load(bundle(tmp_path / "b", source))
+    answers = queue.Queue()
+
+    def work(x):
+        answers.put((x, answer(runner, x)))
+
+    for x in [*range(8), 200, 201] * 2:
+        threading.Thread(target=work, args=(x,), daemon=True).start()
+    for _ in range(20):
+        x, found = answers.get(timeout=60)
+        assert found == ("StateChanged" if x > 100 else str(8 * (x + 1))), x
+
+
 REPROMOTED = """
 import epypes as ep
 LEVELS = [3, 1, 2]

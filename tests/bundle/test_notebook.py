@@ -6,7 +6,7 @@ import nbformat
 import pytest
 
 from epypes.bundle import verify
-from epypes.bundle.notebook import promote_notebook
+from epypes.bundle.promote import promote_notebook
 from epypes.errors import PromotionRefused
 
 CELLS = (

@@ -447,7 +447,7 @@ def test_a_notebook_file_with_classes_gives_the_same_module(promoted, tmp_path):
 
     import nbformat
 
-    from epypes.bundle.notebook import promote_notebook
+    from epypes.bundle.promote import promote_notebook
 
     graph = inspect.getsource(graph_of).replace("names: dict", "names").replace("-> ep.CompGraph", "")
     last = (

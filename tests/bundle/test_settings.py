@@ -21,13 +21,13 @@ from epypes.bundle.settings import (
     Member,
     Settings,
     Unwritable,
-    alike,
+    cast_like,
+    decode_value,
+    encode_value,
     fits,
-    read,
     read_settings,
     unwritable,
     write_settings,
-    written,
 )
 
 
@@ -109,7 +109,7 @@ def test_any_value_comes_back_to_the_last_bit(tmp_path_factory, value):
     ],
 )
 def test_an_entry_is_what_a_person_would_write(value, entry):
-    assert written(value) == entry
+    assert encode_value(value) == entry
 
 
 @pytest.mark.parametrize(
@@ -124,15 +124,15 @@ def test_an_entry_is_what_a_person_would_write(value, entry):
 )
 def test_what_no_entry_holds_is_refused_with_the_way_out(value, words):
     with pytest.raises(Unwritable, match=words):
-        written(value)
+        encode_value(value)
     (reason,) = unwritable({"k": value})
     assert reason.startswith("Hyperparameter 'k' is ")
     assert reason.endswith("or unfreeze it and pass it to run().")
 
 
 def test_a_number_in_the_place_of_another_is_of_its_kind():
-    assert bits(alike(written(np.float32(0.5)), 0.1)) == bits(np.float32(0.1))
-    assert bits(alike(written(3), np.int64(4))) == bits(4)
+    assert bits(cast_like(encode_value(np.float32(0.5)), 0.1)) == bits(np.float32(0.1))
+    assert bits(cast_like(encode_value(3), np.int64(4))) == bits(4)
 
 
 def test_a_value_that_holds_itself_is_refused():
@@ -142,13 +142,13 @@ def test_a_value_that_holds_itself_is_refused():
 
 
 def test_without_the_module_a_member_is_known_by_its_names():
-    assert read(written((Method.CANNY,))) == (Member("Method", "CANNY"),)
+    assert decode_value(encode_value((Method.CANNY,))) == (Member("Method", "CANNY"),)
 
 
 @pytest.mark.parametrize("entry", [{}, {"kind": "pickle", "value": "x"}, {"kind": ["tuple"], "value": []}])
 def test_entries_that_make_no_sense_raise(entry):
     with pytest.raises((KeyError, TypeError)):
-        read(entry)
+        decode_value(entry)
 
 
 def test_a_matrix_stands_in_rows(tmp_path):

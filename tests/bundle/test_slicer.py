@@ -272,13 +272,41 @@ def f(im):
         "\n\nimport functools\n\nLOW = 0.5\nSIZE = 0x10  # of the window\nLIMIT = 3  # sum([1, 2]) in the notebook\n"
         "STEP = 3  # the second\nWEIGHTS = (1, 2,\n           3)\noffset = functools.partial(max, 3, key=abs)",
         "def blurred(im):\n    return smooth(im) + offset(im)",
-        "def make_smooth(k, sigma):\n    def smooth(im):\n        return im * k + sigma\n\n    return smooth",
+        "# Makes filters.\ndef make_smooth(k, sigma):\n    def smooth(im):\n        return im * k + sigma\n\n    return smooth",
         "smooth = make_smooth(k=5, sigma=0)",
         'by_name = {"smooth": smooth}',
         'def f(im):\n    return by_name["smooth"](im) + blurred(im) + LOW + SIZE + LIMIT + STEP + WEIGHTS[2]',
         "",
     ]
     assert executed(text).func_dict["f"](3) == notebook(cell)["f"](3)
+
+
+def test_a_factory_keeps_its_docstring_and_the_comment_above_it():
+    factory = '''
+# One for each line.
+def scaling(k):
+    """Return a function that scales.
+
+    By how much is decided here: é.
+    """
+    # Whole numbers alone.
+    k = int(k)
+    return lambda x: x * k
+
+'''
+    text, refusals = promoted(f"{factory}f = scaling(2.5)\ng = scaling(3)\nh = f\ndef f(x):\n    return h(x) + g(x)\n")
+    assert refusals == []
+    assert (
+        f"""{factory.partition("    # Whole")[0]}
+    def function(x):
+        return x * k
+
+    return function
+"""
+        in text
+    ), text
+    assert text.count("def scaling(k):") == 1
+    assert executed(text).func_dict["f"](2) == 10
 
 
 def test_a_decorator_stands_before_what_it_decorates_wherever_the_notebook_has_it():

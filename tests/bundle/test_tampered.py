@@ -174,3 +174,27 @@ def test_a_folder_that_holds_more_than_a_bundle_may_is_refused_before_it_is_read
         file.truncate(2**30)
     with pytest.raises(BundleError, match=r"pipeline.py is larger than 64 MB"):
         ep.load(folder)
+
+
+BROKEN_MODULES = {
+    "import no_such_package": r"can't be imported at line \d+, 'import no_such_package': ModuleNotFoundError.*'no_such_package'.*install what its requirements\.txt lists",
+    "from numpy import no_such_name": r"can't be imported at line \d+.*: ImportError.*'no_such_name'.*install what its requirements\.txt",
+    "del func_io, func_dict": r"pipeline\.py defines no 'func_dict', 'func_io', which the bundle needs\. Promote the graph again",
+}
+
+
+@pytest.mark.parametrize("line", BROKEN_MODULES)
+def test_a_module_that_lacks_something_is_named_with_the_way_out(line, folder):
+    module = folder / "pipeline.py"
+    module.write_text(f"{module.read_text()}\n{line}\n")
+    write_manifest(folder)
+    with pytest.raises(BundleError, match=BROKEN_MODULES[line]):
+        ep.load(folder)
+
+
+def test_what_the_code_of_a_bundle_raises_when_it_is_imported_stays_its_own_error(folder):
+    module = folder / "pipeline.py"
+    module.write_text(f"{module.read_text()}\nabs('text')\n")
+    write_manifest(folder)
+    with pytest.raises(TypeError, match="abs"):
+        ep.load(folder)

@@ -12,10 +12,9 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.experiment.nodes import (
-    StereoPair,
     decode_keypoints,
     encode_keypoints,
-    parse_request,
+    images_of,
     time_of_request,
 )
 from epypes.wire import Envelope, Event, add_attribute, decode, encode
@@ -30,30 +29,23 @@ def request(**attributes) -> bytes:
     return event.SerializeToString()
 
 
-def test_a_request_has_its_time_and_its_id():
-    event = parse_request(request(t_vreq=1234.5))
-    assert time_of_request(event) == 1234.5
-    assert event.id == "abc"
+def test_a_request_has_its_time():
+    assert time_of_request(request(t_vreq=1234.5)) == 1234.5
 
 
 @pytest.mark.parametrize("event", [b"", b"\xff\xff", request(), request(t_vreq="now"), request(t_vreq=3)])
 def test_a_request_without_a_time_is_refused(event):
     with pytest.raises(MessageError):
-        time_of_request(parse_request(event))
-
-
-def test_a_pair_has_two_images():
-    with pytest.raises(ValueError, match="two images, not 1. Give two cameras"):
-        StereoPair([np.zeros(3)], "abc", {})
+        time_of_request(event)
 
 
 def test_a_pair_comes_through_frames_as_it_was():
-    images = [np.full((50, 70), 9, np.uint8), np.arange(50 * 70 * 3, dtype=np.uint8).reshape(50, 70, 3)]
-    sent = StereoPair(images, "abc", {"t_vreq": 1.5, "acquisition.t_pub": 1e9 + 1 / 3})
-    came = StereoPair.from_envelope(decode(encode(sent.to_envelope())))
-    assert isinstance(came, tuple)
-    assert all(map(np.array_equal, came, images))
-    assert (came.id, came.attributes) == ("abc", sent.attributes)
+    images = {
+        "image_1": np.full((50, 70), 9, np.uint8),
+        "image_2": np.arange(50 * 70 * 3, dtype=np.uint8).reshape(50, 70, 3),
+    }
+    came = images_of(decode(encode(Envelope("epypes.experiment.pair", images))))
+    assert all(np.array_equal(came[name], image) for name, image in images.items())
 
 
 @pytest.mark.parametrize(
@@ -61,7 +53,7 @@ def test_a_pair_comes_through_frames_as_it_was():
 )
 def test_what_is_no_pair_is_refused(item):
     with pytest.raises(MessageError, match="Vision takes pairs of images, not"):
-        StereoPair.from_envelope(item)
+        images_of(item)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 20])

@@ -9,18 +9,23 @@ import cv2
 import numpy as np
 import pytest
 
-from epypes.experiment.nodes import COMPONENTS, Settings, StereoPair, Vision, decode_keypoints, parse_request
+from epypes.experiment.nodes import COMPONENTS, Settings, Vision, decode_keypoints
 from epypes.run import Failure
-from epypes.wire import Event, add_attribute, attributes
+from epypes.wire import Envelope, Event, add_attribute, attributes
 
 TIMES = ("t_react", "t_fin_start", "t_fin_end", "t_fout_start", "t_fout_end", "t_pub")
 TIMEOUT_S = 60.0
 
 
-def request(at: float, request_id: str = "abc") -> Event:
+def request(at: float, request_id: str = "abc") -> bytes:
     event = Event(type="vision_request", id=request_id)
     add_attribute(event, "t_vreq", at)
-    return parse_request(event.SerializeToString())
+    return event.SerializeToString()
+
+
+def pair_of(images, attributes=None) -> Envelope:
+    parts = dict(zip(("image_1", "image_2"), images, strict=True))
+    return Envelope("epypes.experiment.pair", parts, "abc", attributes=attributes or {})
 
 
 @pytest.fixture
@@ -49,10 +54,9 @@ def test_a_request_is_answered_with_the_pair_nearest_to_its_time(acquisition, im
     before, now = time.time(), time.time()
     q_in.put(request(now))
     pair = q_out.get(timeout=TIMEOUT_S)
-    assert isinstance(pair, StereoPair)
-    assert all(
-        np.array_equal(came, cv2.imread(file, cv2.IMREAD_UNCHANGED)) for came, file in zip(pair, images, strict=True)
-    )
+    assert list(pair.parts) == ["image_1", "image_2"]
+    for came, file in zip(pair.parts.values(), images, strict=True):
+        assert np.array_equal(came, cv2.imread(file, cv2.IMREAD_UNCHANGED))
     assert (pair.id, pair.attributes["t_vreq"]) == ("abc", now)
     assert ordered(pair.attributes, "acquisition")
     assert before <= pair.attributes["acquisition.t_react"] <= pair.attributes["acquisition.t_pub"] <= time.time()
@@ -79,12 +83,12 @@ def test_a_slow_camera_is_no_dead_one(images, queues, fps, is_answered):
     with node:
         assert node.wait_until_ready(TIMEOUT_S)
         q_in.put(request(time.time() + 3, "in 3 s"))
-        assert isinstance(said.get(timeout=TIMEOUT_S), StereoPair) is is_answered
+        assert isinstance(said.get(timeout=TIMEOUT_S), Envelope) is is_answered
 
 
 def test_what_is_no_request_is_a_failure_and_the_next_one_is_answered(acquisition, queues):
     q_in, q_out = queues
-    q_in.put(parse_request(b"\xff\xff"))
+    q_in.put(b"\xff\xff")
     assert acquisition.failures.get(timeout=TIMEOUT_S).function == "f_in"
     q_in.put(request(time.time()))
     assert q_out.get(timeout=TIMEOUT_S).id == "abc"
@@ -101,7 +105,7 @@ def test_vision_answers_a_pair_with_its_keypoints_and_the_times_of_both(pictures
     q_in, q_out = queues
     times = {"t_vreq": 1.5, "acquisition.t_pub": 2.5}
     with Vision(q_in, q_out, Settings()):
-        q_in.put(StereoPair(pictures, "abc", times))
+        q_in.put(pair_of(pictures, times))
         answer = q_out.get(timeout=TIMEOUT_S)
     said = attributes(answer)
     assert answer.id == "abc"
@@ -119,7 +123,7 @@ def test_vision_fails_with_the_id_of_its_pair(queues):
     node = Vision(q_in, q_out, Settings())
     node.on_error = failures.put
     with node:
-        q_in.put(StereoPair((np.zeros((9, 9), complex),) * 2, "abc", {}))
+        q_in.put(pair_of((np.zeros((9, 9), complex),) * 2))
         failure = failures.get(timeout=TIMEOUT_S)
     assert failure.function == "detect_and_describe_features_1"
     assert failure.event_id == "abc"
@@ -129,7 +133,7 @@ def test_vision_fails_with_the_id_of_its_pair(queues):
 def test_contents_are_pickled_when_a_peer_of_2019_wants_them(pictures, queues):
     q_in, q_out = queues
     with Vision(q_in, q_out, Settings(unsafe_pickle=True)):
-        q_in.put(StereoPair(pictures, "abc", {}))
+        q_in.put(pair_of(pictures))
         contents = q_out.get(timeout=TIMEOUT_S).contents
     assert decode_keypoints(contents, unsafe_pickle=True).shape == (20, 4)
     assert contents.startswith(b"\x80")
@@ -140,6 +144,6 @@ def test_functions_side_by_side_find_the_same(pictures, queues):
     found = []
     for workers in (1, 2):
         with Vision(q_in, q_out, Settings(workers=workers)):
-            q_in.put(StereoPair(pictures, "abc", {}))
+            q_in.put(pair_of(pictures))
             found.append(q_out.get(timeout=TIMEOUT_S).contents)
     assert found[0] == found[1]

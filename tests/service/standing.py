@@ -8,7 +8,7 @@ import threading
 import uuid
 from contextlib import contextmanager
 
-from epypes.bundle.settings import written
+from epypes.bundle.settings import encode_value
 from epypes.catalog import plain
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.view import view
@@ -26,7 +26,7 @@ class Standing:
         self.runner, self.folder, self.outputs = runner, folder, outputs
         self.state, self.reason = "READY", ""
         self.entries = {
-            t: {**written(plain(v)), **(ranges or {}).get(t, {})} for t, v in runner.hyperparameters.items()
+            t: {**encode_value(plain(v)), **(ranges or {}).get(t, {})} for t, v in runner.hyperparameters.items()
         }
         self.revision = 0
         self.reruns = 0

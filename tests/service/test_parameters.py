@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from epypes.bundle.settings import Member, read, read_settings
+from epypes.bundle.settings import Member, decode_value, read_settings
 from epypes.errors import BundleError
 from epypes.service.parameters import changed_entries, entries_of, misfits, type_of, value_of
 
@@ -55,7 +55,7 @@ def test_an_entry_says_which_type_its_value_has_also_where_json_does_not(token, 
 def test_a_value_within_its_range_is_taken_as_the_kind_it_was(token, given, value):
     after, problems = changed_entries(ENTRIES, {token: given})
     assert not problems
-    found = read(after[token])
+    found = decode_value(after[token])
     assert (found, type(found)) == (value, type(value))
     assert {"value", "kind"} | after[token].keys() == {"value", "kind"} | ENTRIES[token].keys()
     assert {name: entry for name, entry in after.items() if name != token} == {

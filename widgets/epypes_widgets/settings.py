@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.settings import fits, read, written
+from epypes.bundle.settings import decode_value, encode_value, fits
 from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
 from epypes.graph import CompGraph, annotated_params
@@ -160,7 +160,7 @@ def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
     document.add("format", tomlkit.item(FORMAT))
     table = tomlkit.table()
     for token, value in values.items():
-        entry = {"value": value.name, "kind": _MEMBER} if isinstance(value, enum.Enum) else written(plain(value))
+        entry = {"value": value.name, "kind": _MEMBER} if isinstance(value, enum.Enum) else encode_value(plain(value))
         item: Any = tomlkit.inline_table()
         item.update(entry)
         if entry.keys() == {"value"}:  # else its kind must stand beside it
@@ -228,7 +228,7 @@ def _value(entry: Any, token: str, present: Any) -> Any:
     try:
         if isinstance(entry, dict) and entry.get("kind") == _MEMBER:
             return _member(entry["value"], token, present)
-        value = read(entry) if isinstance(entry, dict) else entry
+        value = decode_value(entry) if isinstance(entry, dict) else entry
     except (KeyError, TypeError) as error:
         raise ValueError(f"Hyperparameter {token!r} is a table without a value.") from error
     if not fits(value):

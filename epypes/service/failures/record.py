@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, fields, replace
 from time import time_ns
 from typing import Any, Final
 
-from epypes.bundle.settings import StoredArray, read
+from epypes.bundle.arrays import StoredArray
+from epypes.bundle.settings import decode_value
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"
@@ -161,7 +162,7 @@ def values_of(
     values, gone = {}, []
     for token, entry in record.hyperparameters.items():
         try:
-            value = read(entry, enums)
+            value = decode_value(entry, enums)
         except (LookupError, TypeError, ValueError):
             gone.append(token)
             continue

@@ -32,8 +32,8 @@ from epypes.service.http.security import NEEDS_TOKEN
 _DESCRIPTION: Final = """
 Watches and controls a running service of EPypes.
 
-Reading needs no token. Changes need the service's token, as `Authorization: Bearer TOKEN`; `epypes serve` names the
-file that holds it. A refusal says in `detail` what is wrong, and the way out.
+Reading needs no access token. Changes need that of the service, as `Authorization: Bearer TOKEN`; `epypes serve` names
+the file that holds it. A refusal says in `detail` what is wrong, and the way out.
 """
 _TAGS: Final = [
     {"name": "health", "description": "For monitoring."},

@@ -208,7 +208,7 @@ REFUSALS: Final[Responses] = {
 }
 CHANGE_REFUSALS: Final[Responses] = REFUSALS | {
     401: refused("The token is missing."),
-    403: refused("This is not the service's token."),
+    403: refused("This is not the service's access token."),
 }
 INVALID: Final = refused("The request is not as described here.")
 # FastAPI would put a model into the media type of the events.

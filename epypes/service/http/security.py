@@ -65,14 +65,15 @@ def read_or_make_token(path: Path) -> str:
             _make_token(path)
         return _read_token(path)
     except (OSError, UnicodeDecodeError) as error:
-        text = f"The token file {path} can't be used: {getattr(error, 'strerror', '') or error}. Name another."
+        reason = getattr(error, "strerror", "") or error
+        text = f"The file {path} of the access token can't be used: {reason}. Name another."
         raise KeysError(path, text) from error
 
 
 def _read_token(path: Path) -> str:
     with path.open(encoding="ascii") as file:
         if os.fstat(file.fileno()).st_mode & _GROUP_AND_OTHERS:
-            raise KeysError(path, f"Others can read the token in {path}. Say: chmod 600 {path}")
+            raise KeysError(path, f"Others can read the access token in {path}. Say: chmod 600 {path}")
         token = file.read(1_000).strip()
     if not _TOKEN.fullmatch(token):
         text = f"{path} holds no token: 22 letters and digits or more, in one line. Remove it, and one is made."
@@ -99,15 +100,15 @@ def _make_token(path: Path) -> None:
 async def _check_token(
     request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Security(_BEARER)]
 ) -> None:
-    """Refuse a request without the service's token."""
+    """Refuse a request without the service's access token."""
     state = request.app.state
     hint = f"It is in {state.token_file}, which `epypes serve` has named."
     if "authorization" not in request.headers:
-        text = f"Changes need the service's token, as a header 'Authorization: Bearer TOKEN'. {hint}"
+        text = f"Changes need the service's access token, as a header 'Authorization: Bearer TOKEN'. {hint}"
         raise HTTPException(401, text, {"WWW-Authenticate": 'Bearer realm="epypes"'})
     credentials = "" if given is None else given.credentials
     if not secrets.compare_digest(credentials.encode(), state.token.encode()):
-        raise HTTPException(403, f"This is not the service's token. {hint}")
+        raise HTTPException(403, f"This is not the service's access token. {hint}")
 
 
 NEEDS_TOKEN: Final = Depends(_check_token)

@@ -12,7 +12,7 @@ from time import monotonic, perf_counter_ns
 from typing import TYPE_CHECKING, Any, Self
 
 from epypes.bundle.adapters import REQUEST, in_order
-from epypes.bundle.load import SETTINGS
+from epypes.bundle.manifest import SETTINGS
 from epypes.bundle.settings import read_settings
 from epypes.errors import RemoteFailure, ServiceError
 from epypes.service.state_file import ServiceState, read_states

@@ -17,8 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from epypes.bundle.load import SETTINGS
-from epypes.bundle.manifest import check_manifest
+from epypes.bundle.manifest import SETTINGS, check_manifest
 from epypes.bundle.requirements import epypes_source, pins
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError

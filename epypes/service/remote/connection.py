@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote
 
 from epypes.bundle.adapters import in_order
-from epypes.bundle.settings import written
+from epypes.bundle.settings import encode_value
 from epypes.bundle.writeback import WriteBack
 from epypes.catalog import plain
 from epypes.errors import EpypesError, ServiceError
@@ -59,7 +59,7 @@ def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Co
     url
         Its address, as ``http://127.0.0.1:8642``; the address of its page does too.
     token
-        The token for changes. Without: that of the address, that of EPYPES_TOKEN, or, for a service of this user on
+        The access token. Without: that of the address, that of EPYPES_TOKEN, or, for a service of this user on
         this machine, the one in its token file. Reading needs none.
     timeout_s
         How long an answer may take, in seconds.
@@ -228,7 +228,7 @@ class Connection:
         """
         if not values:
             return self.parameters()
-        entries = {token: written(plain(value)).get("value") for token, value in values.items()}
+        entries = {token: encode_value(plain(value)).get("value") for token, value in values.items()}
         body = {"revision": revision, "values": entries}
         return read_parameters(self.url, self._control.change("PATCH", "/v1/parameters", body))
 

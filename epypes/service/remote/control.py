@@ -40,7 +40,7 @@ class Control:
     url
         Its address, as ``http://127.0.0.1:8642``.
     token
-        The token for changes; empty for none.
+        The access token; empty for none.
     timeout_s
         How long an answer may take, in seconds.
 

@@ -11,7 +11,7 @@ from types import GenericAlias
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 from epypes.bundle.adapters import in_order
-from epypes.bundle.settings import read
+from epypes.bundle.settings import decode_value
 from epypes.catalog import plain
 from epypes.errors import EpypesError, RemoteFailure, ServiceError
 from epypes.graph import CompGraph, colour_order, subgraph
@@ -132,7 +132,7 @@ class RemoteRuns:
         """Return the hyperparameters by token; equal values are one object, by which a panel sees changes."""
         found = {}
         for token, entry in parameters.entries.items():
-            value = read(entry)
+            value = decode_value(entry)
             if len(self._values) >= _MAX_VALUES:
                 self._values.clear()
             found[token] = self._values.setdefault((token, _key(value)), value)
@@ -144,7 +144,7 @@ class RemoteRuns:
     def is_same(self, parameters: Parameters, token: str, value: Any) -> bool:
         """Whether a hyperparameter has this value."""
         entry = parameters.entries.get(token)
-        return entry is not None and _key(read(entry)) == _key(value)
+        return entry is not None and _key(decode_value(entry)) == _key(value)
 
     def fetch(self, targets: Sequence[str], parameters: Parameters) -> Run:
         """Return the last run with these hyperparameters or later ones; of the tokens, what the targets need.

@@ -18,8 +18,9 @@ from time import perf_counter_ns
 from typing import Any, Final
 
 import epypes
+from epypes.bundle.arrays import StoredArray
 from epypes.bundle.load import Bundle, pipeline_of
-from epypes.bundle.settings import Member, StoredArray, read
+from epypes.bundle.settings import Member, decode_value
 from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline
 from epypes.pipeline.answering import Answering
@@ -347,7 +348,7 @@ def _values(entries: Mapping[str, Any], enums: Mapping[str, Any]) -> tuple[dict[
     values, problems = {}, {}
     for token, entry in entries.items():
         try:
-            values[token] = read(entry, enums)
+            values[token] = decode_value(entry, enums)
         except Exception as error:  # an entry of a kind may fail in the making of a value of that kind
             problems[token] = f"This value can't be read: {_text_of(error)}."
             continue

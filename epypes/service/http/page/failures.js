@@ -1,4 +1,4 @@
-// Which events failed, and how are they opened again?
+// The table of the events that failed, and how each is opened again.
 import { ask, confirmed, make, part, say } from "./server.js";
 
 const MOST = 50;

@@ -1,4 +1,4 @@
-// How does the picture of the graph follow the runs?
+// The picture of the graph follows the runs, and a token is shown larger when it is chosen.
 import { part } from "./server.js";
 
 // A picture costs the worker some milliseconds; more of them could not be looked at.
@@ -45,7 +45,9 @@ export function watchGraph() {
     if (vertex) event.preventDefault();
     look(vertex);
   });
-  part("look").addEventListener("close", () => (looked = ""));
+  const dialog = /** @type {HTMLDialogElement} */ (part("look"));
+  // The event of a closing comes later, and by then another token may have been chosen.
+  dialog.addEventListener("close", () => dialog.open || (looked = ""));
 }
 
 async function follow() {

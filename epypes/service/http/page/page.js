@@ -1,4 +1,4 @@
-// What does the live page show, and what is done from it?
+// The live page: its parts, and what is done from it.
 import { loadFailures, sawFailure } from "./failures.js";
 import { redraw, sawPlace, watchGraph } from "./graph.js";
 import { sawParameters, showButtons, watchParameters } from "./parameters.js";
@@ -69,10 +69,10 @@ async function drain() {
 function refuseToken() {
   keepToken("");
   showToken();
-  say("notice", "This is not the service's access key. It is in the file that epypes serve names.");
+  say("notice", "This is not the service's access token. It is in the file that epypes serve names.");
 }
 
-/** Take an access key only if the service knows it. @param {string} given */
+/** Take an access token only if the service knows it. @param {string} given */
 async function useToken(given) {
   keepToken(given);
   try {
@@ -88,7 +88,7 @@ async function useToken(given) {
 }
 
 function showToken() {
-  part("token-hint").textContent = hasToken() ? "The access key is right: changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
+  part("token-hint").textContent = hasToken() ? "The access token is right: changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
   part("token-form").querySelector("button").textContent = hasToken() ? "Forget" : "Use";
   part("token").hidden = hasToken();
   part("token-form").querySelector("label").hidden = hasToken();

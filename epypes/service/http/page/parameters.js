@@ -1,4 +1,4 @@
-// How are parameters seen and changed by hand?
+// The fields of the parameters: what the service has, and what is changed here.
 import { ask, confirmed, hasToken, make, part, Refused, say } from "./server.js";
 
 const STEPS = 200;

@@ -1,4 +1,4 @@
-// How many events are answered, how long does one take, and how was that in the last two minutes?
+// Rates and durations of the last two minutes.
 import { make, part } from "./server.js";
 
 const KEPT_S = 120;

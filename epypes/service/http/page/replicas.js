@@ -1,4 +1,4 @@
-// Which replicas share the events, and how are they?
+// The table of the replicas that share the events.
 import { make, part } from "./server.js";
 
 const DIGITS = 12;

@@ -1,4 +1,4 @@
-// How does the page ask the service, and hear of it?
+// Requests to the service, and its stream of events.
 
 const TOKEN = "epypes-token";
 const AGAIN_MS = 2000;

@@ -1,0 +1,296 @@
+"""Libraries as one process has them: their settings, and what their modules hold, as texts to be compared.
+
+A notebook may set a library otherwise or patch it in ways that no syntax shows: by a helper, through ``vars``, or deep
+in another module. What it has changed is found by comparison with a process that has imported the same modules and
+nothing else. What differs between two such processes too, such as the time of an import, is no change.
+
+A number, text, tuple or array is described by its content; a function by its home, instructions and defaults; a class
+by its home, and by its attributes where it is defined; any other object by its type alone. Left out is what libraries
+count and remember in: private values, and names that are neither constants nor named by the bundle. So are modules that
+only one of the processes has loaded.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib
+import sys
+import types
+import warnings
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
+from typing import Any, Final
+
+from epypes.bundle.resolve import evaluated
+
+Attributes = Mapping[str, Mapping[str, str]]
+
+# Only where a function catches warnings, errors in their place change what it computes.
+WARNINGS: Final = "warnings.simplefilter"
+_ATOMS: Final = (int, float, complex, bool, str, bytes, type(None), type(...))
+# Longer descriptions are digests.
+_MOST_TEXT: Final = 60
+_MOST_ENTRIES: Final = 500
+_MOST_BYTES: Final = 65_536
+# They hold the interpreter's own state, which is another one in each kind of process.
+_OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
+# What these put into other modules, every notebook has.
+_OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
+_OWN: Final = ("__main__.", "unittest.mock.")
+_ALWAYS: Final = frozenset({"builtins", "numpy"})
+
+
+# -- settings --------------------------------------------------------------------------------------------------------
+
+
+def library_settings() -> dict[str, str]:
+    """Return how Python and libraries are set in this process, where that changes what functions compute."""
+    found: dict[str, str] = {}
+    with warnings.catch_warnings(action="ignore"):  # of options that are deprecated
+        for module, read in _SETTINGS:
+            if module in sys.modules:
+                found |= read(sys.modules[module])
+    return found
+
+
+def is_of_texts(setting: str) -> bool:
+    """Whether a setting changes nothing but how values are written as text."""
+    return setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
+
+
+def _of_python(sys: Any) -> dict[str, str]:
+    kinds = [kind for action, _, kind, *_ in warnings.filters if action == "error"]
+    limit = sys.getrecursionlimit()
+    # Jedi, which completes names in notebooks, sets it when it is imported.
+    usual = 1_000 if limit == 3_000 and "jedi" in sys.modules else limit
+    return {
+        "sys.setrecursionlimit": f"{usual}",
+        "sys.set_int_max_str_digits": f"{sys.get_int_max_str_digits()}",
+        WARNINGS: ", ".join(
+            f"{kind.__name__} is an error"
+            for kind in kinds
+            if isinstance(kind, type) and not kind.__module__.startswith(_OF_NOTEBOOKS)
+        ),
+    }
+
+
+def _of_numpy(numpy: Any) -> dict[str, str]:
+    raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
+    return {
+        "numpy.seterr": f"{raising or 'no errors are raised'}",
+        "numpy.set_printoptions": f"{numpy.get_printoptions()}",
+    }
+
+
+def _of_decimal(decimal: Any) -> dict[str, str]:
+    context = decimal.getcontext()
+    parts = "prec", "rounding", "Emin", "Emax", "capitals", "clamp"
+    traps = sorted(signal.__name__ for signal, is_on in context.traps.items() if is_on)
+    text = ", ".join(f"{part}={getattr(context, part)}" for part in parts)
+    return {"decimal.getcontext": f"{text}, traps={' '.join(traps)}"}
+
+
+def _of_pandas(pandas: Any) -> dict[str, str]:
+    # Without what pandas sets by what shows it.
+    left_out = "display.encoding", "display.max_columns"
+    options = (option for option in _options(pandas.options) if option[0] not in left_out)
+    return {f"pandas.set_option {name}": f"{value!r}" for name, value in options}
+
+
+def _options(options: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name in dir(options):
+        value = getattr(options, name)
+        if type(value) is type(options):
+            yield from _options(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _of_matplotlib(matplotlib: Any) -> dict[str, str]:
+    # Without what notebooks set themselves.
+    left_out = ("backend", "interactive")
+    parameters = {name: matplotlib.rcParams[name] for name in matplotlib.rcParams if not name.startswith(left_out)}
+    return {f"matplotlib.rcParams {name}": f"{value!r}" for name, value in parameters.items()}
+
+
+_SETTINGS: Final[tuple[tuple[str, Callable[[Any], dict[str, str]]], ...]] = (
+    ("sys", _of_python),
+    ("numpy", _of_numpy),
+    ("decimal", _of_decimal),
+    ("locale", lambda locale: {"locale.setlocale": locale.setlocale(locale.LC_ALL)}),
+    ("cv2", lambda cv2: {"cv2.setUseOptimized": f"{cv2.useOptimized()}"}),
+    ("pandas", _of_pandas),
+    ("matplotlib", _of_matplotlib),
+)
+
+
+# -- what modules hold -----------------------------------------------------------------------------------------------
+
+
+def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes:
+    """Return what the libraries of a bundle hold, by module and attribute.
+
+    Parameters
+    ----------
+    named
+        The modules that the bundle names.
+    new
+        The modules that it has imported.
+    """
+    own = {name.partition(".")[0] for name in named}
+    packages = own | _ALWAYS | ({name.partition(".")[0] for name in new} - sys.stdlib_module_names)
+    packages = {name for name in packages - _OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
+    return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages)
+
+
+def load_named(text: str) -> None:
+    """Load what a bundle's module names of libraries that load their parts when these are first asked for."""
+    nodes, names = [*ast.walk(ast.parse(text))], {**sys.modules}
+    for node in nodes:
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            with suppress(Exception):  # whatever a module raises that no sample has imported
+                if isinstance(node, ast.ImportFrom):
+                    source = importlib.import_module(node.module or "")
+                    names[alias.asname or alias.name] = getattr(source, alias.name)
+                else:
+                    names[alias.asname or alias.name] = importlib.import_module(alias.name)
+    for node in nodes:
+        if isinstance(node, ast.Attribute):
+            with suppress(Exception):
+                evaluated(node, names)
+
+
+def attributes_of(modules: Iterable[str]) -> Attributes:
+    """Return what modules hold by module and attribute, of those that are loaded."""
+    loaded = {name: sys.modules[name] for name in modules if isinstance(sys.modules.get(name), types.ModuleType)}
+    return {name: dict(_attributes(module, name)) for name, module in loaded.items()}
+
+
+def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return by module and attribute what differs here from there, as the descriptions of both.
+
+    What is only here counts if a bundle's text names it; what was not yet computed there does not.
+    """
+    mentioned = _mentioned(text)
+    found: dict[tuple[str, str], tuple[str, str]] = {}
+    for module, described in here.items():
+        others = there.get(module, {})
+        for name, value in described.items() if others else ():
+            other = others.get(name, "")
+            last = name.rpartition(".")[2]
+            if not other:
+                # A lazy package gets its modules, and what they are for, when these are first asked for.
+                is_lazy = value.startswith((f"{module.partition('.')[0]}.", "module "))
+                is_changed = last in mentioned and not is_lazy
+            else:
+                is_changed = other not in ("None", value) and not value.startswith(_OF_NOTEBOOKS)
+                # Not what a loop over a set has left behind in a module.
+                is_changed &= last.isupper() or "." in name or last in mentioned or f".{last}" in other
+                # Nor what libraries do to each other.
+                is_changed &= not last.startswith("_") or value.startswith(_OWN)
+            if is_changed:
+                found[module, name] = value, other
+    return found
+
+
+def _mentioned(text: str) -> set[str]:
+    """Return the names that a module asks objects for: attributes, imported names and texts."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Attribute):
+            found.add(node.attr)
+        elif isinstance(node, ast.ImportFrom):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found.add(node.value)
+    return found
+
+
+def _attributes(owner: Any, home: str, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Give the attributes of a module or class with their descriptions."""
+    for name, value in [*vars(owner).items()]:
+        is_function = isinstance(value, (type, *_FUNCTIONS)) or type(value) in _INNER
+        if name.startswith("_repr_") or (name.startswith("__") and (not prefix or not is_function)):
+            continue
+        if name.startswith("_") and not is_function:
+            continue
+        yield f"{prefix}{name}", _described(value)
+        if isinstance(value, type) and value.__module__ == home and value.__qualname__ == f"{prefix}{name}":
+            yield from _attributes(value, home, f"{prefix}{name}.")
+        elif type(value) is dict and len(value) <= _MOST_ENTRIES:
+            entries = ((key, entry) for key, entry in value.items() if type(key) in (str, int))
+            yield from ((f"{prefix}{name}[{key!r}]", _described(entry)) for key, entry in entries)
+
+
+def _described(value: Any) -> str:
+    """Describe a value by a short text that is the same in each process."""
+    try:
+        text = _text(value)
+    except Exception:  # whatever an object raises that is made only to be imported
+        return "unknown"
+    if len(text) <= _MOST_TEXT or isinstance(value, _ATOMS):
+        return text if len(text) <= _MOST_TEXT else _digest(text.encode("utf-8", "surrogatepass"))
+    head = text.partition(" ")[0]
+    return f"{head} {_digest(text.encode('utf-8', 'surrogatepass'))}"
+
+
+def _text(value: Any) -> str:
+    kind = type(value)
+    if kind in _ATOMS:
+        return repr(value)
+    if isinstance(value, types.ModuleType):
+        return f"module {vars(value).get('__name__')}"
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__}"
+    if kind is types.FunctionType:
+        # Without objects such as sys.stdout; of functions the name, since they may refer to each other.
+        given = [*enumerate(value.__defaults__ or ()), *sorted((value.__kwdefaults__ or {}).items())]
+        defaults = [
+            (key, _name(default) if callable(default) else default)
+            for key, default in given
+            if callable(default) or isinstance(default, (*_ATOMS, tuple, frozenset))
+        ]
+        home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
+        return f"{home} {_code_text(value.__code__)} {_text(tuple(defaults))}"
+    if inner := _INNER.get(kind) or (("_implementation",) if kind.__name__ == "_ArrayFunctionDispatcher" else ()):
+        return f"{' '.join(_text(getattr(value, name)) for name in inner)} {kind.__name__}"
+    if kind in (tuple, frozenset):
+        # Many tuples of names are made of sets.
+        is_ordered = kind is tuple and not all(isinstance(part, str) for part in value)
+        parts = [*map(_text, value)]
+        return f"{kind.__name__} {parts if is_ordered else sorted(parts)}"
+    if kind.__module__ == "numpy" and kind.__name__ == "ndarray" and not value.dtype.hasobject:
+        content = _digest(value.tobytes()) if value.nbytes <= _MOST_BYTES else ""
+        return f"array {value.dtype} {value.shape} {content}"
+    return f"{_text(kind)} .{_name(value)}" if callable(value) else _text(kind)
+
+
+def _name(value: Any) -> str:
+    """Return the name of a function of a C library; not its module, which NumPy sets when another one is imported."""
+    try:
+        return str(getattr(value, "__name__", ""))
+    except Exception:  # whatever an object raises that imports or connects when it is asked for an attribute
+        return ""
+
+
+def _code_text(code: types.CodeType) -> str:
+    constants = [_code_text(part) if isinstance(part, types.CodeType) else _text(part) for part in code.co_consts]
+    return _digest(code.co_code + repr((code.co_names, constants)).encode("utf-8", "surrogatepass"))
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=8).hexdigest()
+
+
+_FUNCTIONS: Final = (types.FunctionType, types.BuiltinFunctionType)
+# What objects that stand for a function have it in.
+_INNER: Final[Mapping[type, tuple[str, ...]]] = {
+    types.MethodType: ("__func__",),
+    staticmethod: ("__func__",),
+    classmethod: ("__func__",),
+    property: ("fget", "fset"),
+    functools.partial: ("func", "args"),
+    functools._lru_cache_wrapper: ("__wrapped__",),
+}

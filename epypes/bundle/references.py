@@ -1,0 +1,98 @@
+"""References: the names that a function reads, and what they mean to it.
+
+A name means what the function has captured, else a global of its module, else a builtin. The slice, the descriptions of
+objects, the mutable state, the fingerprints and the static checks all resolve names here.
+"""
+
+from __future__ import annotations
+
+import builtins
+import dis
+import importlib.util
+import types
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from typing import Any, Final
+
+# A class reads the name of the module around it, whichever that is, and has its own annotations.
+_OF_EVERY_CLASS: Final = frozenset({"__name__", "__annotations__"})
+_LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
+
+
+def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
+    """Give code, and that of all that is defined in it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from nested_codes(constant)
+
+
+def global_names(code: types.CodeType) -> list[str]:
+    """Return the global names that code and all code in it read, each once, in order.
+
+    Names to which the body of a class has given a meaning before are not global there.
+    """
+    found: dict[str, None] = {}
+    for inner in nested_codes(code):
+        own = {*_OF_EVERY_CLASS}
+        for instruction in dis.get_instructions(inner):
+            if instruction.opname == "STORE_NAME":
+                own.add(instruction.argval)
+            elif instruction.opname in ("LOAD_GLOBAL", "LOAD_FROM_DICT_OR_GLOBALS") or (
+                instruction.opname == "LOAD_NAME" and instruction.argval not in own
+            ):
+                found[instruction.argval] = None
+    return [*found]
+
+
+def imported_modules(function: types.FunctionType) -> list[str]:
+    """Return the names of all modules that a function may import when it runs, sorted."""
+    package = function.__globals__.get("__package__") or ""
+    found: set[str] = set()
+    for code in nested_codes(function.__code__):
+        # Before each import statement, its level and the names that it takes are loaded.
+        steps = [one for one in dis.get_instructions(code) if one.opname in {*_LOADS_CONSTANT, "IMPORT_NAME"}]
+        for level, taken, step in zip(steps, steps[1:], steps[2:], strict=False):
+            if step.opname == "IMPORT_NAME":
+                with suppress(ImportError):  # a relative import beyond the package
+                    name = importlib.util.resolve_name("." * level.argval + step.argval, package)
+                    # A name that is taken from a package may be a module of it.
+                    found |= {name, *(f"{name}.{one}" for one in taken.argval or ())}
+    return sorted(found)
+
+
+def cells_of(function: types.FunctionType) -> dict[str, types.CellType]:
+    """Return the variables that a function has captured, by name; not those without a value."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    return {name: cell for name, cell in cells if cell != types.CellType()}
+
+
+def captured_by(function: types.FunctionType) -> dict[str, Any]:
+    """Return the values that a function has captured, by name."""
+    return {name: cell.cell_contents for name, cell in cells_of(function).items()}
+
+
+def namespace_of(function: types.FunctionType) -> dict[str, Any]:
+    """Return all names that a function may read but for the builtins."""
+    return {**function.__globals__, **captured_by(function)}
+
+
+def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str, Any]:
+    """Return what names mean to a function; those that mean nothing are left out."""
+    captured, free = captured_by(function), function.__code__.co_freevars
+    found: dict[str, Any] = {}
+    for name in names:
+        if name in free:
+            found |= {name: captured[name]} if name in captured else {}
+        elif name in function.__globals__:
+            found[name] = function.__globals__[name]
+        elif hasattr(builtins, name):
+            found[name] = getattr(builtins, name)
+    return found
+
+
+def defaults_of(function: types.FunctionType) -> dict[str, Any]:
+    """Return the defaults of a function by parameter, as they are by now."""
+    given, code = function.__defaults__ or (), function.__code__
+    names = code.co_varnames[: code.co_argcount]
+    return dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
