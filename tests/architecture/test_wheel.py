@@ -36,8 +36,8 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
         "epypes/catalog/skimage.toml",
         "epypes/display/paint/explore.js",
         "epypes/display/paint/explore.css",
-        "epypes_widgets/picking.css",
-        "epypes_widgets/picking.js",
+        "epypes_widgets/view/picker.css",
+        "epypes_widgets/view/picker.js",
         "epypes_widgets/view/main.js",
         "epypes_widgets/view/view.css",
     ):

@@ -362,7 +362,7 @@ def test_opened_again_without_its_kernel_the_last_picture_and_values_are_there(
     lab_page: Any, notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab
 ) -> None:
     # The last of all tests: one notebook at a time is open.
-    assert notebook.execute("panel['threshold'] = 66; panel.wait(60); panel._still.update()") == ""
+    assert notebook.execute("panel['threshold'] = 66; panel.wait(60); panel._static.update()") == ""
     assert panel.page.locator(".epypes-static").is_hidden()
     panel.wait("() => JSON.stringify(jupyterapp.shell.currentWidget.content.model.toJSON()).includes('66')")
     notebook.save()

@@ -45,7 +45,7 @@ def test_a_search_is_followed_and_its_best_is_used_and_undone(searched: Notebook
     panel.wait(_STATE, "done")
     search = panel.page.locator(".epypes-search")
     assert search.get_attribute("data-trials") == "40"
-    assert "40 trials; best 0." in search.locator(".epypes-search-said").inner_text()
+    assert "40 trials; best 0." in search.locator(".epypes-search-message").inner_text()
     assert panel.values == before, "a search sets nothing"
     assert search.locator(".epypes-search-best").get_attribute("d").startswith("M")
     search.scroll_into_view_if_needed()
@@ -63,15 +63,15 @@ def test_a_search_that_can_not_be_begun_says_why(searched: Notebook) -> None:
     panel = PanelOnScreen(searched)
     panel.page.locator(".epypes-trials").fill("0")
     panel.page.locator(".epypes-search-start").click()
-    said = panel.page.locator(".epypes-search-said")
+    said = panel.page.locator(".epypes-search-message")
     assert said.inner_text() == "! Give a number of trials from 1 to 10000."
-    searched.execute("k = panel.search._measure; panel.search._measure = 'no token'")
+    searched.execute("k = panel.search._metric; panel.search._metric = 'no token'")
     panel.page.locator(".epypes-trials").fill("5")
     panel.page.locator(".epypes-search-start").click()
     panel.wait(_STATE, "refused")
     assert "No token 'no token'" in said.inner_text()
     panel.page.locator(".epypes-search").scroll_into_view_if_needed()
-    searched.execute("panel.search._measure = k")
+    searched.execute("panel.search._metric = k")
 
 
 def test_a_search_is_stopped_while_the_panel_goes_on(searched: Notebook) -> None:
@@ -84,4 +84,4 @@ def test_a_search_is_stopped_while_the_panel_goes_on(searched: Notebook) -> None
     panel.page.locator(".epypes-search").scroll_into_view_if_needed()
     panel.page.locator(".epypes-search-stop").click()
     panel.wait(_STATE, "done")
-    assert "Stopped after" in panel.page.locator(".epypes-search-said").inner_text()
+    assert "Stopped after" in panel.page.locator(".epypes-search-message").inner_text()

@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 from skimage import data
 
-from epypes_widgets.view.script import joined, styles
+from epypes_widgets.view import script, styles
 from tests.browser.jupyter import open_page
 
 _HERE = Path(__file__).parents[1] / "widgets" / "view"
@@ -52,7 +52,7 @@ class ViewPage:
         self._files = {
             "": ("text/html", (_HERE / "harness.html").read_text()),
             "kernel.js": ("text/javascript", (_HERE / "kernel.js").read_text()),
-            "view.js": ("text/javascript", joined()),
+            "view.js": ("text/javascript", script()),
             "view.css": ("text/css", styles()),
             "photo.jpg": ("image/jpeg", _photo()),
         }

@@ -53,7 +53,7 @@ class FrontEnd:
 
     def tell(self, kind: str, **content: Any) -> None:
         message = json.loads(json.dumps({"kind": kind, **content}))
-        self._up(lambda: self.view._answer(self.view, message, []))
+        self._up(lambda: self.view._handle(self.view, message, []))
 
     def wait_for_values(self, timeout_s: float, **values: Any) -> None:
         """Return when the picture that is shown was computed with these values."""

@@ -98,7 +98,6 @@ def test_a_label_that_is_no_constant_of_this_value_is_not_taken_for_one() -> Non
     assert source(1, Hint("fast", choices=(1,))) == "1"
     assert source(1, Hint("imread", choices=(1,))) == "1"
     assert source(1, Hint(choices=(0, 1))) == "1"
-    assert source(1, Hint("INTER_LINEAR"), module="not_imported") == "1"
     assert source("x", Hint("INTER_LINEAR", choices=("x",))) == '"x"'
 
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
 
-import numpy as np
 import pytest
 
-import epypes as ep
-from epypes_widgets import Panel, tune
+from epypes_widgets import Panel
 from tests.widgets.frontend import FrontEnd
 
 
@@ -28,62 +25,23 @@ def test_undo_before_the_hand_lets_go_adds_an_entry_with_its_picture(panel: Pane
     assert [entry.token for entry in panel._history.entries if entry.picture] == ["mask", "mask"]
 
 
-def test_an_entry_has_the_picture_of_the_stage_before_while_one_chosen_just_now_is_not_computed(
-    image: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entered, go_on = threading.Event(), threading.Event()
-
-    def brighten(image: Any, gain: int) -> Any:
-        if gain == 3:
-            entered.set()
-            assert go_on.wait(60)
-        return (image // 2 * gain).astype(np.uint8)
-
-    def above(bright: Any, threshold: int = 100) -> Any:
-        return np.where(bright > threshold, 255, 0).astype(np.uint8)
-
-    cg = ep.CompGraph(
-        {"brighten": brighten, "above": above},
-        {"brighten": (("image", "gain"), "bright"), "above": (("bright", "threshold"), "mask")},
-    )
-    runner = ep.CompGraphRunner(cg, {"gain": 1, "threshold": 100})
-    runner.run(image=image)
-    panel = tune(runner, token="bright")
-    FrontEnd(panel, monkeypatch)
-    panel.wait(60)
-    panel["gain"] = 3
-    assert entered.wait(60)
-    panel.token = "mask"
-    go_on.set()
-    panel.wait(60)
-    last = panel._history.entries[-1]
-    assert (last.values["gain"], last.token) == (3, "bright")
-    assert last.picture is not None
-    panel["threshold"] = 90
-    panel.wait(60)
-    last = panel._history.entries[-1]
-    assert last.token == "mask"
-    assert last.picture is not None
-    panel.close(10)
-
-
 def test_what_the_screen_is_told_last_is_the_newest_history(
     panel: Panel, screen: FrontEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     panel.wait(60)
-    told, code = [], panel._screen._code
+    told, code = [], panel._screen.code
 
     def slow_code() -> str:
         """While one thread has looked at the history and not told it yet, have another add an entry and tell it."""
         if not told:
-            other = threading.Thread(target=panel._screen.tell_history)
+            other = threading.Thread(target=panel._screen.send_history)
             told.append(other)
             panel._history.commit({"gain": 2, "threshold": 61})
             other.start()
             other.join(0.2)
         return code()
 
-    monkeypatch.setattr(panel._screen, "_code", slow_code)
-    panel._screen.tell_history()
+    monkeypatch.setattr(panel._screen, "code", slow_code)
+    panel._screen.send_history()
     told[0].join(60)
     assert [entry["values"]["threshold"] for entry in screen.last("history")["entries"]] == [100, 61]

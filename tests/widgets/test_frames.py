@@ -12,8 +12,8 @@ from PIL import Image
 
 import epypes as ep
 from epypes_widgets.frames import make_frame
-from epypes_widgets.plain import plain
-from epypes_widgets.shown import Comparison, Shown
+from epypes_widgets.screen import Comparison, Shown
+from epypes_widgets.values import json_value
 from tests.colours import red_image, red_runner
 
 
@@ -81,7 +81,7 @@ def test_histograms_come_only_when_they_are_shown(runner: ep.CompGraphRunner) ->
 
 def test_values_can_always_be_written_as_json() -> None:
     values = [1, np.int64(2), 0.5, float("nan"), float("inf"), None, True, "a", (1, 2), object(), np.zeros(3)]
-    assert json.loads(json.dumps([plain(value) for value in values], allow_nan=False))[:3] == [1, 2, 0.5]
+    assert json.loads(json.dumps([json_value(value) for value in values], allow_nan=False))[:3] == [1, 2, 0.5]
 
 
 def test_the_big_picture_has_the_colours_that_the_annotations_say() -> None:

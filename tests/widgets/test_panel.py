@@ -39,7 +39,7 @@ def test_moving_a_control_runs_the_stale_functions_only(panel: Panel, screen: Fr
 
 @pytest.mark.slow
 def test_the_front_end_moving_a_slider_does_the_same(panel: Panel, runner: ep.CompGraphRunner) -> None:
-    panel._hand.control("threshold").widget.value = 61
+    panel._controls.control("threshold").widget.value = 61
     panel.wait(60)
     assert (panel["threshold"], runner["threshold"]) == (61, 61)
 
@@ -122,12 +122,12 @@ def test_settings_go_to_a_file_and_come_back(panel: Panel, screen: FrontEnd, tmp
     assert screen.last("settings") == {
         "kind": "settings",
         "names": ["better", "good"],
-        "said": "Saved better.toml.",
+        "text": "Saved better.toml.",
         "ok": True,
     }
     screen.tell("load", name="bettr")
     assert screen.last("settings")["ok"] is False
-    assert "better" in screen.last("settings")["said"]
+    assert "better" in screen.last("settings")["text"]
     (tmp_path / "good.toml").write_text((tmp_path / "good.toml").read_text().replace("77", "777"))
     with pytest.raises(ValueError, match="can't be 777"):
         panel.load("good")
@@ -304,7 +304,7 @@ def test_a_closed_panel_takes_no_values_and_its_controls_are_off(panel: Panel, c
     panel.close(10)
     with pytest.raises(RuntimeError, match="closed"):
         panel["threshold"] = 60
-    assert all(entry.widget.disabled for entry in panel._hand.controls)
+    assert all(entry.widget.disabled for entry in panel._controls.controls)
     assert calls.counts == {}
 
 
@@ -353,10 +353,10 @@ def test_values_set_from_many_threads_leave_panel_and_runner_agreed(runner: ep.C
 
 def test_a_value_that_is_set_is_asked_for_once(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[dict[str, Any]] = []
-    monkeypatch.setattr(panel._tuning.worker, "ask", lambda: asked.append(panel._session.wanted))
+    monkeypatch.setattr(panel._worker, "post", lambda key, *_: key == "compute" and asked.append(panel._session.wanted))
     panel["threshold"] = 60
     panel["threshold"] = 60
-    panel._hand.control("threshold").widget.value = 61
+    panel._controls.control("threshold").widget.value = 61
     assert asked == [{"threshold": 60}, {"threshold": 60}, {"threshold": 61}]
 
 

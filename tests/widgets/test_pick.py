@@ -166,6 +166,6 @@ def test_the_runner_keeps_no_picker_alive(result: ep.SweepResult) -> None:
 def test_a_saved_notebook_shows_the_sheet_with_the_chosen_tile_marked(picker: Picker) -> None:
     picker.choose(5)
     picker.wait(60)
-    page = picker._still._html()
+    page = picker._static.html()
     assert page.count("✓ chosen") == 1
     assert page.count("<img ") == 6

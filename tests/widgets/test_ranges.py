@@ -12,7 +12,7 @@ import pytest
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes.hints import Roi, Text
-from epypes_widgets.ranges import described, ranges
+from epypes_widgets.ranges import range_text, ranges
 
 
 def runner_of(function: Callable[..., Any], *inputs: str, **values: Any) -> ep.CompGraphRunner:
@@ -78,7 +78,7 @@ def test_a_value_beyond_what_is_usual_widens_what_is_offered() -> None:
 def test_constants_have_their_names() -> None:
     how = found(runner_of(lambda im, how: cv2.resize(im, (9, 9), interpolation=how), "im", how=1))["how"]
     assert dict(zip(how.labels, how.choices, strict=True))["INTER_LINEAR"] == 1
-    assert "INTER_LINEAR" in described(how)
+    assert "INTER_LINEAR" in range_text(how)
     kind = found(runner_of(lambda im, t: cv2.threshold(im, 0, 255, t)[1], "im", t=cv2.THRESH_OTSU))["t"]
     assert dict(zip(kind.labels, kind.choices, strict=True))["THRESH_BINARY_INV|THRESH_OTSU"] == 9
 
@@ -274,4 +274,4 @@ def test_what_is_compared_with_an_image_is_a_threshold_whatever_it_is_called() -
     ],
 )
 def test_a_range_is_told_in_words(param: Any, words: str) -> None:
-    assert described(param) == words
+    assert range_text(param) == words

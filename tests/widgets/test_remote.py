@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from time import monotonic
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -211,18 +212,18 @@ def test_what_others_set_under_the_hand_is_told_and_not_overwritten(
 ) -> None:
     is_following(panel, service)
     screen.tell("hold", names=["threshold"])
-    panel._hand.control("threshold").widget.value = 61
+    panel._controls.control("threshold").widget.value = 61
     panel.wait(TIMEOUT_S)
     service.set_parameters({"threshold": 33}, None)
-    until(lambda: any("Somebody else has set threshold to 33" in line for line in panel.log))
-    panel._hand.control("threshold").widget.value = 62
+    until(lambda: any("Another client has set threshold to 33" in line for line in panel.log))
+    panel._controls.control("threshold").widget.value = 62
     panel.wait(TIMEOUT_S)
     assert service.entries["threshold"]["value"] == 33
-    assert "Somebody else has set threshold to 33" in screen.last("note")["text"]
+    assert "Another client has set threshold to 33" in screen.last("note")["text"]
     screen.tell("release")
     panel.wait(TIMEOUT_S)
     assert (panel["threshold"], service.entries["threshold"]["value"]) == (33, 33)
-    panel._hand.control("threshold").widget.value = 63
+    panel._controls.control("threshold").widget.value = 63
     panel.wait(TIMEOUT_S)
     assert (service.entries["threshold"]["value"], screen.last("note")["text"]) == (63, "")
 
@@ -341,6 +342,7 @@ def test_a_service_without_any_event_yet_shows_its_first_one(
         screen = FrontEnd(panel, monkeypatch)
         said = {"kind": "note", "text": "Waiting for the first event at tcp://127.0.0.1:1", "waits": True}
         assert (panel.error, screen.last("note")) == ("", said)
+        assert repr(panel) == "<Panel: 2 hyperparameters; up to date>"
         is_following(panel, service)
         service.event(image=image)
         until(lambda: panel.token == "mask")
@@ -450,10 +452,42 @@ def test_what_a_service_can_not_do_is_said(connection: Connection, panel: Panel,
         tune("http://127.0.0.1:8642")  # type: ignore[arg-type]
 
 
+def test_what_was_set_just_before_is_written_back(
+    connection: Connection, panel: Panel, screen: FrontEnd, service: Standing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[Any] = []
+
+    def write_back(dry_run: bool = False) -> Any:
+        written.append(service.entries["threshold"]["value"])
+        return SimpleNamespace(diff="", digest="3f" * 32)
+
+    monkeypatch.setattr(connection, "write_back", write_back)
+    panel.set(threshold=61)
+    assert panel.write_back().diff == ""
+    screen.tell("set", values={"threshold": 62})
+    screen.tell("write_back", dry_run=False)
+    until(lambda: screen.of("written")[-1:] != [] and screen.last("written")["state"] == "done")
+    screen.tell("live", on=False)
+    panel.wait(TIMEOUT_S)
+    panel.set(threshold=63)
+    panel.write_back()
+    assert written == [61, 62, 63]
+
+
+def test_a_value_that_the_service_refuses_is_not_written_back_as_another(connection: Connection) -> None:
+    panel = tune(connection, threshold=(0, 1000))
+    panel.set(threshold=900)
+    with pytest.raises(ServiceError, match="Not set in the service: threshold 900"):
+        panel.write_back()
+    panel.close(TIMEOUT_S)
+
+
 def test_writing_back_is_asked_of_a_service_alone(runner: ep.CompGraphRunner, monkeypatch: pytest.MonkeyPatch) -> None:
     panel = tune(runner)
     screen = FrontEnd(panel, monkeypatch)
     screen.tell("write_back", dry_run=True)
+    with pytest.raises(TypeError, match="Promote it"):
+        panel.write_back()
     assert screen.last("setup")["writes_back"] is False
     assert screen.last("written")["text"] == "Not written: a runner has no bundle to write to. Promote it."
     panel.close(TIMEOUT_S)

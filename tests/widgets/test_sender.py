@@ -10,7 +10,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from epypes_widgets.sender import Frame, FrameSender
+from epypes_widgets.frames import Frame
+from epypes_widgets.view import FrameSender
 
 
 def frame(seq: int) -> Frame:
@@ -21,13 +22,14 @@ class Clock:
     """Calls what was put off when it is told to."""
 
     def __init__(self) -> None:
-        self.delay_s, self.due = 0.0, lambda: None
+        self.delay_s = 0.0
+        self.due: Callable[[], object] = lambda: None
 
-    def __call__(self, delay_s: float, function: Callable[[], None]) -> None:
+    def __call__(self, key: str, function: Callable[[], object], delay_s: float) -> None:
         self.delay_s, self.due = delay_s, function
 
 
-def never(delay_s: float, function: object) -> None:
+def never(key: str, function: object, delay_s: float) -> None:
     """Stand for a clock that has not got so far."""
 
 

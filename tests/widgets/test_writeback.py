@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from epypes.errors import ServiceError
-from epypes_widgets.writeback import WritingBack, Written
+from epypes_widgets.promotion import Outcome, ReportingJob, start_write_back
 
 TIMEOUT_S = 60.0
 DIFF = "--- pipeline.toml\n+++ pipeline.toml\n-value = 70\n+value = 60\n"
@@ -32,49 +32,61 @@ class Service:
 
 
 @pytest.fixture
-def told() -> list[Written]:
+def told() -> list[Outcome]:
     return []
 
 
-@pytest.fixture
-def back(told: list[Written]) -> WritingBack:
-    return WritingBack(told.append)
+class Back:
+    """Writes the values of a service back, and keeps what is reported."""
+
+    def __init__(self, service: Service, told: list[Outcome]) -> None:
+        self._job, self._service = ReportingJob("epypes-write-back", told.append), service
+
+    def start(self, *, dry_run: bool) -> bool:
+        return start_write_back(self._job, self._service.write_back, dry_run=dry_run)
+
+    def wait(self, timeout_s: float) -> Outcome | None:
+        return self._job.wait(timeout_s)
 
 
-def test_a_dry_run_shows_the_differences_and_writing_tells_the_digest(back: WritingBack, told: list[Written]) -> None:
+def test_a_dry_run_shows_the_differences_and_writing_tells_the_digest(told: list[Outcome]) -> None:
     service = Service()
-    assert back.start(service, dry_run=True)
-    assert back.wait(TIMEOUT_S) == Written("diff", "This would change in pipeline.toml.", DIFF)
-    assert back.start(service, dry_run=False)
+    back = Back(service, told)
+    assert back.start(dry_run=True)
+    assert back.wait(TIMEOUT_S) == Outcome("diff", "This would change in pipeline.toml.", diff=DIFF)
+    assert back.start(dry_run=False)
     done = back.wait(TIMEOUT_S)
-    assert done == Written("done", "Written to pipeline.toml and replayed; the bundle is 3f3f3f3f3f3f now.", DIFF)
+    assert done == Outcome("done", "Written to pipeline.toml and replayed; the bundle is 3f3f3f3f3f3f now.", diff=DIFF)
     assert [each.state for each in told] == ["running", "diff", "running", "done"]
     assert service.asked == [True, False]
 
 
-def test_without_differences_nothing_is_asked(back: WritingBack) -> None:
-    back.start(Service(diff=""), dry_run=True)
+def test_without_differences_nothing_is_asked(told: list[Outcome]) -> None:
+    back = Back(Service(diff=""), told)
+    back.start(dry_run=True)
     done = back.wait(TIMEOUT_S)
-    assert done == Written("done", "pipeline.toml has these values already; the bundle is 3f3f3f3f3f3f.")
+    assert done == Outcome("done", "pipeline.toml has these values already; the bundle is 3f3f3f3f3f3f.")
 
 
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (ServiceError("x", "The replay differs."), "Not written: The replay differs."),
-        (ValueError("oh"), "Not written: ValueError: oh"),
+        (ServiceError("x", "The replay differs."), "Not done: The replay differs."),
+        (ValueError("oh"), "Not done: ValueError: oh"),
     ],
 )
-def test_a_refusal_is_told(back: WritingBack, error: Exception, text: str) -> None:
-    back.start(Service(error=error), dry_run=False)
-    assert back.wait(TIMEOUT_S) == Written("refused", text)
+def test_a_refusal_is_told(told: list[Outcome], error: Exception, text: str) -> None:
+    back = Back(Service(error=error), told)
+    back.start(dry_run=False)
+    assert back.wait(TIMEOUT_S) == Outcome("refused", text)
 
 
-def test_one_is_written_at_a_time(back: WritingBack) -> None:
+def test_one_is_written_at_a_time(told: list[Outcome]) -> None:
     service = Service()
+    back = Back(service, told)
     service.may_end.clear()
-    assert back.start(service, dry_run=True)
-    assert not back.start(service, dry_run=False)
+    assert back.start(dry_run=True)
+    assert not back.start(dry_run=False)
     service.may_end.set()
     back.wait(TIMEOUT_S)
     assert service.asked == [True]

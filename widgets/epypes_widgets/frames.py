@@ -1,27 +1,63 @@
-"""How do tokens of a run become a frame for the screen?"""
+"""Frames: tokens of a run as a binary message for the screen.
+
+Pictures travel as one binary message per frame, never in a trait: traits are kept, compared and saved.
+"""
 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Container
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display import encode_image
+from epypes.display import Marks, Most, Picture, Scene, encode_image, scene_of, scene_picture
 from epypes.run import Run
-from epypes_widgets.looking.histogram import histogram_of
-from epypes_widgets.looking.overlay import overlay, scene
-from epypes_widgets.plain import plain_values
-from epypes_widgets.sender import Frame
-from epypes_widgets.shown import Shown
+from epypes_widgets.histogram import histogram_of
+from epypes_widgets.values import json_values
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from epypes_widgets.screen import Shown
+
+    Floats = npt.NDArray[np.float64]
 
 # Wider than the box on a usual screen; a JPEG of this size is about 150 kB and takes 5 ms to encode.
 MAX_SIDE_PX: Final = 1400
 PINNED_SIDE_PX: Final = 320
-_TEXT_LENGTH: Final = 400
+_MAX_TEXT: Final = 400
+_THUMBNAIL_PX: Final = 96
+_THUMBNAIL_BYTES: Final = 4_000
+# More points hide the image, and make messages of hundreds of kilobytes. A place has two coordinates.
+MAX_DRAWN: Final = Most(marks=2_000, line=10_000, places=10_000, pairs=150)
+_NO_SIZE, _NO_ANGLE = 0.0, -1.0
+_DECIMALS: Final = 2
+# Places are those of pixels' centres. The corners of boxes are between pixels.
+_CENTRE: Final = 0.5
 
-# What the front end is told of a picture, and its bytes.
-Picture = tuple[dict[str, Any], bytes]
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What goes to the screen at once.
+
+    Attributes
+    ----------
+    seq
+        Rises with every frame of a panel.
+    content
+        What the front end gets beside the bytes; can be written as JSON.
+    buffers
+        The bytes of the pictures, in the order in which the content lists them.
+    changed_ns
+        When the newest value in it was set, by this process's ``perf_counter_ns``; 0 if no value was set.
+    """
+
+    seq: int
+    content: dict[str, Any]
+    buffers: tuple[bytes, ...] = field(default=(), repr=False)
+    changed_ns: int = 0
 
 
 def make_frame(
@@ -50,22 +86,26 @@ def make_frame(
     had_pictures
         The tokens that have had a picture: where nothing is found any more, the image without marks is left.
     content
-        Is told to the front end as it is.
+        Is sent as it is.
     """
     drawn = partial(picture, run, had_pictures=had_pictures)
     pictures = [drawn(token, "main")]
     if shown.other:
         pictures.append(drawn(shown.other, "other"))
-    pictures += [drawn(token, "pinned", max_side_px=PINNED_SIDE_PX) for token in shown.pinned]
+    pictures += [drawn(pinned, "pinned", max_side_px=PINNED_SIDE_PX) for pinned in shown.pinned]
+    report = run.report
     content = {
         "kind": "frame",
         "seq": seq,
         "token": token,
-        "values": plain_values(run.hyperparameters),
-        **_times(run),
+        "values": json_values(run.hyperparameters),
+        "compute_ms": report.total_ns / 1e6,
+        "times_ms": {name: ns / 1e6 for name, ns in report.durations_ns.items()},
+        "ran": len(report.ran),
+        "reused": len(report.reused),
         "pictures": [described for described, _ in pictures],
         "histogram": histogram_of(run, token) if shown.has_histogram else None,
-        "histograms": {token: histogram_of(run, token) for token in shown.cut} if shown.has_histogram else {},
+        "histograms": {cut: histogram_of(run, cut) for cut in shown.cut} if shown.has_histogram else {},
         **content,
     }
     return Frame(seq, content, tuple(data for _, data in pictures if data), changed_ns)
@@ -73,8 +113,8 @@ def make_frame(
 
 def picture(
     run: Run, token: str, role: str, max_side_px: int = MAX_SIDE_PX, had_pictures: Container[str] = ()
-) -> Picture:
-    """Return a token as a picture: an image, marks over their image, or anything else as text."""
+) -> tuple[dict[str, Any], bytes]:
+    """Return what the front end gets of a token, and its bytes: an image, marks over their image, or a text."""
     found = scene(run, token, had_marks=token in had_pictures)
     described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
     if found is None:
@@ -98,15 +138,72 @@ def picture(
 def text_of(value: Any) -> str:
     """Return a value as a short text."""
     short = reprlib.Repr()
-    short.maxother = short.maxstring = _TEXT_LENGTH
+    short.maxother = short.maxstring = _MAX_TEXT
     return short.repr(value)
 
 
-def _times(run: Run) -> dict[str, Any]:
-    report = run.report
+def still_picture(run: Run, token: str, max_side_px: int, most_bytes: int) -> Picture | None:
+    """Return a token as one picture, its marks drawn over their image; None if it is none, or not up to date."""
+    found = scene_of(run, token, had_marks=True)
+    return None if found is None else scene_picture(found, max_side_px, most_bytes)
+
+
+def thumbnail(run: Run, token: str | None) -> Picture | None:
+    """Return the thumbnail of a token, of at most 96 x 96 pixels; None if it is no picture, or not up to date."""
+    return None if token is None else still_picture(run, token, _THUMBNAIL_PX, _THUMBNAIL_BYTES)
+
+
+def scene(run: Run, token: str, *, had_marks: bool = False) -> Scene | None:
+    """Return the image as which a token is shown, with all marks that the screen gets; None if it is shown as text.
+
+    ``had_marks``: whether the token had a picture in an earlier run: if nothing is found any more, the image is left.
+    """
+    return scene_of(run, token, MAX_DRAWN, had_marks=had_marks)
+
+
+def overlay(scene: Scene) -> dict[str, Any] | None:
+    """Return what is drawn over the image of a scene, ready for JSON; None if the token is the image itself.
+
+    Returns
+    -------
+    dict or None
+        ``points``: lists of x, y, diameter (0: none), angle in degrees (-1: none); ``lines``: lists of x and y in turn;
+        ``closed``: whether lines return to where they began; ``total``: how many points or lines there are; ``what``
+        they are. Coordinates are in pixels of the image, whose first pixel reaches from 0 to 1.
+    """
+    marks = scene.marks
+    if marks is None:
+        return None
+    shift = 0.0 if scene.what == "boxes" else _CENTRE
     return {
-        "compute_ms": report.total_ns / 1e6,
-        "times_ms": {name: ns / 1e6 for name, ns in report.durations_ns.items()},
-        "ran": len(report.ran),
-        "reused": len(report.reused),
+        "points": _plain(_points(marks, shift)),
+        "lines": list(_lines(marks, shift)),
+        "closed": marks.are_closed,
+        "total": marks.total,
+        "what": scene.what,
     }
+
+
+def _points(marks: Marks, shift: float) -> Floats:
+    import numpy as np
+
+    count = len(marks.points)
+    extents = np.tile((_NO_SIZE, _NO_ANGLE), (count, 1)) if marks.extents is None else marks.extents
+    # A keypoint may be of no size, or of one that is not a number.
+    known = np.where(np.isfinite(extents), extents, (_NO_SIZE, _NO_ANGLE))
+    return np.concatenate([marks.points + shift, known], axis=1)
+
+
+def _lines(marks: Marks, shift: float) -> Iterator[list[float]]:
+    import numpy as np
+
+    coordinates = _plain((np.concatenate([np.empty((0, 2)), *marks.lines]) + shift).reshape(-1))
+    end = 0
+    for line in marks.lines:
+        start, end = end, end + 2 * len(line)
+        yield coordinates[start:end]
+
+
+def _plain(numbers: Floats) -> list[Any]:
+    rounded: list[Any] = numbers.round(_DECIMALS).tolist()
+    return rounded

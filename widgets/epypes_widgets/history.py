@@ -1,4 +1,4 @@
-"""Which values has the hand stopped at, and how does it get back to them?"""
+"""The history of a runner: the values that were committed, undo and redo, and a store that keeps them."""
 
 from __future__ import annotations
 
@@ -7,27 +7,33 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from pathlib import Path
+from time import time_ns
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 from weakref import WeakKeyDictionary
 
 from epypes.display import Picture
 from epypes.optional import optional_import
-from epypes_widgets.looking.films import is_alike
-from epypes_widgets.places import Tunable
-from epypes_widgets.values import differing, said_change
+from epypes.store import Store, opened_store
+from epypes.store.writer import SeriesWriter
+from epypes_widgets.target import Tunable
+from epypes_widgets.values import change_text, differing, json_value
 
 if TYPE_CHECKING:
-    from epypes_widgets.historyframe import HistoryFrame
+    import pandas as pd
 
-_KEPT: Final = 1_000
+    from epypes_widgets.history_table import HistoryTable
+
+_MAX_ENTRIES: Final = 1_000
+_KIND: Final = "tuning"
 _histories: WeakKeyDictionary[Tunable, History] = WeakKeyDictionary()
 _lock = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """Values that were committed; entries are told apart by identity, since values may be arrays.
+    """Values that were committed; entries are compared by identity, since values may be arrays.
 
     Attributes
     ----------
@@ -81,7 +87,7 @@ class History:
     {'threshold': 70}
     """
 
-    def __init__(self, limit: int = _KEPT) -> None:
+    def __init__(self, limit: int = _MAX_ENTRIES) -> None:
         if type(limit) is not int or limit < 1:
             raise ValueError(f"limit is how many entries are kept, 1 or more, not {limit!r}.")
         self.limit = limit
@@ -90,8 +96,6 @@ class History:
         self._path: tuple[Entry, ...] = ()
         self._place = -1
         self._committed = 0
-        self._images: tuple[Any, ...] = ()
-        self._images_from = 1
         self._watchers: tuple[Callable[[Entry], object], ...] = ()
 
     def watch(self, callback: Callable[[Entry], object]) -> Callable[[], None]:
@@ -105,17 +109,15 @@ class History:
             self._watchers = (*self._watchers, callback)
         return forget
 
-    def commit(
-        self,
-        values: Mapping[str, Any],
-        *,
-        token: str | None = None,
-        picture: Picture | None = None,
-        compute_ms: float | None = None,
-        label: str = "",
-        image: int | None = None,
-    ) -> Entry | None:
-        """Add an entry and make it the current one; the parameters are what ``Entry`` has.
+    def commit(self, values: Mapping[str, Any], *, image: int | None = None, **about: Any) -> Entry | None:
+        """Add an entry and make it the current one.
+
+        Parameters
+        ----------
+        values, image
+            As in ``Entry``.
+        about
+            What else ``Entry`` has: token, picture, compute_ms, label.
 
         Returns
         -------
@@ -123,18 +125,19 @@ class History:
             None if values and image are those of the current entry: nothing is added then.
         """
         with self._lock:
-            if _is_at(self._current(), values, image):
+            current = self._current()
+            if current is not None and current.image == image and not differing(current.values, values):
                 return None
-            kept = MappingProxyType({name: _kept(value) for name, value in values.items()})
+            kept = MappingProxyType({name: _copy(value) for name, value in values.items()})
             self._committed += 1
             now = datetime.now().astimezone().replace(microsecond=0)
-            entry = Entry(self._committed, kept, now, token, picture, compute_ms, label, image)
+            entry = Entry(self._committed, kept, now, image=image, **about)
             self._entries = (*self._entries, entry)[-self.limit :]
             oldest = self._entries[0].number
             walked = self._path[: self._place + 1]
             self._path = (*(old for old in walked if old.number >= oldest), entry)
             self._place = len(self._path) - 1
-        return self._told(entry)
+        return self._report(entry)
 
     def undo(self) -> Entry | None:
         """Go one entry back and return it; None if there is none."""
@@ -155,21 +158,12 @@ class History:
         with self._lock:
             entry = next((entry for entry in self._entries if entry.number == number), None)
             if entry is None:
-                raise LookupError(f"No entry {number!r} in this history. {self._range()}")
+                known = f"has {self._entries[0].number} to {self._entries[-1].number}" if self._entries else "is empty"
+                raise LookupError(f"No entry {number!r} in this history. It {known}.")
             if entry not in self._path:
                 self._path = (*self._path[: self._place + 1], entry)
             self._place = self._path.index(entry)
-        return self._told(entry)
-
-    def use_images(self, images: tuple[Any, ...]) -> None:
-        """Know which images the indices of entries mean from now on; earlier ones go on meaning these very images."""
-        with self._lock:
-            if len(images) != len(self._images) or not all(map(is_alike, images, self._images)):
-                self._images, self._images_from = images, self._committed + 1
-
-    def is_of_images(self, entry: Entry) -> bool:
-        """Whether the index of an entry's image means one of the present images."""
-        return entry.image is not None and entry.number >= self._images_from
+        return self._report(entry)
 
     @property
     def current(self) -> Entry | None:
@@ -193,16 +187,16 @@ class History:
         """All entries that are kept, the oldest first, wherever undo and redo lead."""
         return self._entries
 
-    def to_frame(self) -> HistoryFrame:
+    def to_frame(self) -> HistoryTable:
         """Return a pandas table by number that shows its thumbnails in a notebook.
 
         Its columns are the hyperparameters, then at, token, image, compute_ms, label and picture; if a hyperparameter
         is called like one of these, the latter has an underscore after its name.
         """
         with optional_import():
-            from epypes_widgets.historyframe import frame_of
+            from epypes_widgets.history_table import table_of
 
-        return frame_of(self._entries)
+        return table_of(self._entries)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -221,17 +215,12 @@ class History:
                 return None
             self._place += by
             entry = self._path[self._place]
-        return self._told(entry)
+        return self._report(entry)
 
-    def _told(self, entry: Entry) -> Entry:
+    def _report(self, entry: Entry) -> Entry:
         for watcher in self._watchers:
             watcher(entry)
         return entry
-
-    def _range(self) -> str:
-        if not self._entries:
-            return "It is empty."
-        return f"It has {self._entries[0].number} to {self._entries[-1].number}."
 
 
 def history_of(runner: Tunable) -> History:
@@ -244,20 +233,95 @@ def changed(before: Entry | None, after: Entry) -> str:
     """Return what an entry has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; empty for the first."""
     if before is None:
         return ""
-    one, other = (_numbered(entry.image) for entry in (before, after))
+    # As images are counted on the screen.
+    one, other = ("-" if entry.image is None else entry.image + 1 for entry in (before, after))
     moved = f"image {one} -> {other}" if one != other else ""
-    return ", ".join(filter(None, (said_change(before.values, after.values), moved)))
+    return ", ".join(filter(None, (change_text(before.values, after.values), moved)))
 
 
-def _numbered(image: int | None) -> str:
-    """Return an index as images are counted on the screen."""
-    return "-" if image is None else str(image + 1)
-
-
-def _is_at(current: Entry | None, values: Mapping[str, Any], image: int | None) -> bool:
-    return current is not None and current.image == image and not differing(current.values, values)
-
-
-def _kept(value: Any) -> Any:
+def _copy(value: Any) -> Any:
     """Return a list or dict as a copy, which the user does not write to later."""
     return copy.copy(value) if type(value) in (list, dict, set) else value
+
+
+# The prefix of the row keys of a history: the entries of every history count from 1.
+_prefixes: WeakKeyDictionary[History, str] = WeakKeyDictionary()
+
+
+class StoredHistory:
+    """Writes each entry of a history to a series, also those that it has already; nothing waits for the database.
+
+    Parameters
+    ----------
+    runner
+        What is tuned.
+    store
+        A path, a URL or a Store.
+    name
+        Of the series; None for those of the sink tokens.
+    history
+        Its entries are written.
+    failed
+        Is called with a text on what goes wrong, on a thread.
+
+    Raises
+    ------
+    StoreError
+        There can be no such database.
+    """
+
+    def __init__(
+        self,
+        runner: Tunable,
+        store: str | Path | Store,
+        name: str | None,
+        history: History,
+        failed: Callable[[str], object],
+    ) -> None:
+        self._runner, self._store, self._history = runner, store, history
+        self._name = ", ".join(runner.cg.sink_tokens) if name is None else name
+        self._writer = SeriesWriter(store, _KIND, self._name, report=failed)
+        self._lock = threading.Lock()
+        self._last: Entry | None = None
+        self._forget = history.watch(lambda _entry: self._write_new())
+        self._write_new()
+
+    def to_frame(self, timeout_s: float = 5.0) -> pd.DataFrame:
+        """Return all that was ever committed under this name, in earlier sessions too, as a pandas table.
+
+        Raises
+        ------
+        StoreError
+            It can't be read.
+        """
+        with opened_store(self._store) as store:
+            self._writer.flush(timeout_s)
+            return cast(Store, store).series(_KIND, self._name).to_frame()
+
+    def close(self, timeout_s: float) -> None:
+        """Write what waits, and nothing more."""
+        self._forget()
+        self._writer.close(timeout_s)
+
+    def _write_new(self) -> None:
+        with self._lock:
+            prefix = _prefixes.setdefault(self._history, str(time_ns()))
+            for entry in self._history.entries:
+                if self._last is None or entry.number > self._last.number:
+                    self._writer.append(f"{prefix}-{entry.number}", self._row(entry))
+                    self._last = entry
+
+    def _row(self, entry: Entry) -> dict[str, Any]:
+        # A store knows NaN and infinities, JSON does not.
+        values = {name: v if isinstance(v, float) else json_value(v) for name, v in entry.values.items()}
+        return {
+            "at": entry.at.isoformat(),
+            "values": values,
+            "changed": changed(self._last, entry),
+            "total_ms": entry.compute_ms,
+            # Of a service's hyperparameters.
+            "revision": getattr(self._runner, "revision", None),
+            "token": entry.token,
+            "image": entry.image,
+            "label": entry.label,
+        }

@@ -1,7 +1,7 @@
-"""What does a panel do when its view says something?
+"""What a panel does with each message of its view.
 
-Each answer is made on the thread that answers the front end, and returns at once: nothing is computed here but a probe,
-which reads a pixel of pictures that are there.
+Each is handled on the thread that handles the messages of the front end, and returns at once: nothing is computed here
+but a probe, which reads a pixel of pictures that are there.
 """
 
 from __future__ import annotations
@@ -13,96 +13,116 @@ from typing import Any
 from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner
 from epypes_widgets import settings
-from epypes_widgets.looking.overlay import scene
-from epypes_widgets.looking.probe import probe
-from epypes_widgets.picture import Message
-from epypes_widgets.promotion import Outcome, Promotion
-from epypes_widgets.searching import Searching, told
-from epypes_widgets.shown import Comparison
+from epypes_widgets.cases import Cases
+from epypes_widgets.frames import scene
+from epypes_widgets.promotion import Outcome, ReportingJob, start_promotion, start_write_back
+from epypes_widgets.screen import Comparison
+from epypes_widgets.search import Search
+from epypes_widgets.stages import probe
 from epypes_widgets.tuning import Tuning
-from epypes_widgets.writeback import WritingBack, Written
+from epypes_widgets.view import Handler, Message
 
 
 class Messages:
-    """Takes the messages of a view.
+    """Handles the messages of a view.
 
     Parameters
     ----------
     tuning
         Does what they ask for.
-    save, load
-        Write the present values to a file, and set those of one.
+    cases
+        Need to know whether there is a view.
+    save, load, write_back
+        Write the present values to a file, set those of one, and write them into the bundle of the service.
     search
         Of hyperparameters; None if there is no metric.
     """
 
     def __init__(
-        self, tuning: Tuning, save: Callable[[str], Path], load: Callable[[str], None], search: Searching | None
+        self,
+        tuning: Tuning,
+        cases: Cases,
+        save: Callable[[str], Path],
+        load: Callable[[str], None],
+        write_back: Callable[[bool], Any],
+        search: Search | None,
     ) -> None:
-        self._tuning, self._save_to, self._load_from, self.search = tuning, save, load, search
+        self._tuning, self._screen, self._cases, self._search = tuning, tuning.screen, cases, search
+        self._save, self._load = save, load
+        self._write_back, self._promotion = write_back, ReportingJob("epypes-promotion", self._promoted)
+        self._writing = ReportingJob("epypes-write-back", self._written)
         if search is not None:
-            search.report = lambda _: self._tuning.screen.view.tell("optimised", told(search) or {})
-        self.promotion = Promotion(self._promoted)
-        self.writing_back = WritingBack(self._written)
+            search.report = lambda: self._screen.view.tell("optimised", search.content())
 
     @property
-    def handlers(self) -> dict[str, Callable[[Message], object]]:
+    def handlers(self) -> dict[str, Handler]:
         """What is called with each kind of message."""
-        tuning = self._tuning
+        tuning, screen = self._tuning, self._screen
         return {
             "ready": self._ready,
-            "hold": lambda message: tuning.hand.hold(message["names"]),
+            "seen": lambda _: tuning.seen(),
+            "left": self._left,
+            "hold": lambda message: tuning.controls.hold(message["names"]),
             "release": lambda _: tuning.release(),
             "set": lambda message: self._set(message["values"]),
             "move": self._move,
             "reset": self._reset,
-            "stage": lambda message: self._look(token=tuning.screen.require_stage(message["token"])),
-            "pin": self._pin,
-            "compare": self._compare,
-            "histogram": lambda message: self._look(has_histogram=bool(message["on"])),
             "live": self._live,
             "run": lambda _: tuning.run(),
-            "probe": self._probe,
             "image": lambda message: tuning.want_image(int(message["index"])),
+            "stage": lambda message: tuning.look(token=screen.require_stage(message["token"])),
+            "pin": self._pin,
+            "compare": self._compare,
+            "histogram": lambda message: tuning.look(has_histogram=bool(message["on"])),
+            "probe": self._probe,
             "undo": lambda _: tuning.go_to(tuning.history.undo),
             "redo": lambda _: tuning.go_to(tuning.history.redo),
             "goto": lambda message: tuning.go_to(lambda: tuning.history.goto(int(message["number"]))),
-            "save": lambda message: self._file(self._saved, message),
-            "load": lambda message: self._file(self._loaded, message),
+            "save": lambda message: self._file(message, lambda name: f"Saved {self._save(name).name}."),
+            "load": lambda message: self._file(message, self._loaded),
             "promote": self._promote,
-            "write_back": self._write_back,
-            "optimise": self._optimise,
-            "optimise_stop": self._stop,
-            "optimise_use": lambda _: self._use_best(),
-            "seen": lambda _: tuning.seen(),
-            "left": lambda _: tuning.leave(),
+            "write_back": self._start_write_back,
+            **self._search_handlers,
+        }
+
+    @property
+    def _search_handlers(self) -> dict[str, Handler]:
+        search = self._search
+        if search is None:
+            return {}
+        return {
+            "optimise": lambda message: search.start(int(message["n"])),
+            "optimise_stop": lambda _: search.stop(),
+            "optimise_use": lambda _: self._set(search.best.setting if search.best else {}, by_user=False),
         }
 
     def _ready(self, _message: Message) -> None:
         self._tuning.release()  # a page that is loaded anew holds nothing
-        self._tuning.screen.ready()
+        self._screen.ready()
         self._tuning.come_back()
+        self._cases.come_back()
+
+    def _left(self, _message: Message) -> None:
+        self._tuning.leave()
+        self._cases.leave()
 
     # -- values -------------------------------------------------------------------------------------------------
 
-    def _move(self, message: Message) -> None:
-        self._tuning.hand.slide(message["places"])
-        if message["values"]:
-            self._set(message["values"], commit=False)
-
-    def _set(self, values: Mapping[str, Any], *, commit: bool = True) -> None:
-        # What the view sets is what the hand holds.
-        values = self._tuning.hand.uncontested(values)
-        self._tuning.hand.moved(values)
+    def _set(self, values: Mapping[str, Any], *, commit: bool = True, by_user: bool = True) -> None:
+        if not values:
+            return
         try:
-            self._tuning.want(values, commit=commit, is_by_hand=True)
+            self._tuning.want(values, commit=commit, by_user=by_user)
         except ValueError as error:
-            self._tuning.screen.fail(str(error), names=tuple(values))
+            self._screen.fail(str(error), names=tuple(values))
+
+    def _move(self, message: Message) -> None:
+        self._tuning.controls.slide(message["places"])
+        self._set(message["values"], commit=False)
 
     def _reset(self, message: Message) -> None:
-        first, controls = self._tuning.runner.first_hyperparameters, self._tuning.hand.values
-        names = message["names"] or controls
-        self._set({name: first[name] for name in names if name in first and name in controls})
+        first, controls = self._tuning.runner.first_hyperparameters, self._tuning.controls.values
+        self._set({n: first[n] for n in message["names"] or controls if n in first and n in controls})
 
     def _live(self, message: Message) -> None:
         self._tuning.is_live = bool(message["on"])
@@ -110,95 +130,57 @@ class Messages:
 
     # -- looking ------------------------------------------------------------------------------------------------
 
-    def _look(self, **parts: Any) -> None:
-        self._tuning.screen.change(**parts)
-        self._tuning.look()
-
     def _pin(self, message: Message) -> None:
-        screen = self._tuning.screen
-        token = screen.require_stage(message["token"])
-        self._look(pinned=screen.shown.with_pin(token, on=bool(message["on"])).pinned)
+        token = self._screen.require_stage(message["token"])
+        others = tuple(name for name in self._screen.shown.pinned if name != token)
+        self._tuning.look(pinned=(*others, token) if message["on"] else others)
 
     def _compare(self, message: Message) -> None:
-        asked, screen = message["with"], self._tuning.screen
-        if asked is None:
-            self._look(comparison=None)
-            return
-        token = screen.require_stage(asked["token"]) if asked["kind"] == "stage" else ""
-        self._look(comparison=Comparison(str(asked["kind"]), int(asked.get("number", 0)), token))
+        asked, comparison = message["with"], None
+        if asked is not None:
+            token = self._screen.require_stage(asked["token"]) if asked["kind"] == "stage" else ""
+            comparison = Comparison(str(asked["kind"]), int(asked.get("number", 0)), token)
+        self._tuning.look(comparison=comparison)
 
     def _probe(self, message: Message) -> None:
-        screen, run = self._tuning.screen, self._tuning.session.result
-        token = screen.shown.token
+        run, token = self._tuning.session.result, self._screen.shown.token
         seen = None if run is None or token is None else scene(run, token)
         if run is None or seen is None:
             return
         x, y = float(message["x"]), float(message["y"])
-        rows = probe(run, screen.stages, x, y, seen)
-        screen.view.tell("probe", {"id": message["id"], "x": x, "y": y, "rows": rows})
+        rows = probe(run, self._screen.stages, x, y, seen)
+        self._screen.view.tell("probe", {"id": message["id"], "x": x, "y": y, "rows": rows})
 
-    # -- remembering --------------------------------------------------------------------------------------------
+    # -- files, bundles -----------------------------------------------------------------------------------------
 
-    def _file(self, act: Callable[[str], str], message: Message) -> None:
-        """Read or write settings, and tell what came of it."""
+    def _file(self, message: Message, act: Callable[[str], str]) -> None:
+        """Read or write settings, and say what came of it."""
         try:
-            said, is_done = act(str(message["name"]).strip()), True
+            text, is_done = act(str(message["name"]).strip()), True
         except (EpypesError, ValueError) as error:
-            said, is_done = str(error), False
-        names = list(settings.names("."))
-        self._tuning.screen.view.tell("settings", {"names": names, "said": said, "ok": is_done})
-
-    def _saved(self, name: str) -> str:
-        return f"Saved {self._save_to(name).name}."
+            text, is_done = str(error), False
+        self._screen.view.tell("settings", {"names": list(settings.names(".")), "text": text, "ok": is_done})
 
     def _loaded(self, name: str) -> str:
-        self._load_from(name)
+        self._load(name)
         return f"Loaded {name}."
-
-    # -- optimising ---------------------------------------------------------------------------------------------
-
-    def _optimise(self, message: Message) -> None:
-        if self.search is not None:
-            self.search.start(int(message["n"]))
-
-    def _stop(self, _message: Message) -> None:
-        if self.search is not None:
-            self.search.stop()
-
-    def _use_best(self) -> None:
-        setting = None if self.search is None else self.search.found.setting
-        if setting is None:
-            return
-        try:
-            self._tuning.want(setting)
-        except (EpypesError, ValueError) as error:
-            self._tuning.screen.fail(str(error), names=tuple(setting))
-
-    # -- promoting ----------------------------------------------------------------------------------------------
 
     def _promote(self, message: Message) -> None:
         runner, to = self._tuning.runner, str(message["to"])
         if isinstance(runner, CompGraphRunner):
-            self.promotion.start(runner, to)
+            start_promotion(self._promotion, runner, to)
         else:
-            text = (
-                "Not promoted: a running service is a bundle already. Write its values back, or promote the notebook."
-            )
+            text = "Not promoted: a running service is a bundle already. Write its values back."
             self._promoted(Outcome("refused", text, to))
 
-    def _write_back(self, message: Message) -> None:
-        place = self._tuning.session.place
-        if place.is_written_back:
-            self.writing_back.start(place.owner, dry_run=bool(message["dry_run"]))
+    def _start_write_back(self, message: Message) -> None:
+        if self._tuning.session.is_service:
+            start_write_back(self._writing, self._write_back, dry_run=bool(message["dry_run"]))
         else:
-            self._written(Written("refused", "Not written: a runner has no bundle to write to. Promote it."))
-
-    def _written(self, told: Written) -> None:
-        content = {"state": told.state, "text": told.text, "diff": told.diff}
-        self._tuning.screen.view.tell("written", content)
+            self._written(Outcome("refused", "Not written: a runner has no bundle to write to. Promote it."))
 
     def _promoted(self, outcome: Outcome) -> None:
-        screen = self._tuning.screen
-        screen.view.tell("promoted", {"state": outcome.state, "text": outcome.text, "to": outcome.to})
-        if outcome.printed:
-            screen.log(f"Printed while promoting: {outcome.printed}")
+        self._screen.view.tell("promoted", {"state": outcome.state, "text": outcome.text, "to": outcome.to})
+
+    def _written(self, outcome: Outcome) -> None:
+        self._screen.view.tell("written", {"state": outcome.state, "text": outcome.text, "diff": outcome.diff})

@@ -1,7 +1,8 @@
-"""How does a user see, move and read the hyperparameters of a runner, or of a running service?"""
+"""The panel of a notebook: controls for the hyperparameters of a runner or a running service, and the picture."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,33 +10,36 @@ from typing import TYPE_CHECKING, Any
 import ipywidgets
 
 from epypes.batch.check import CheckResult, Checks
-from epypes.errors import NotComputed
+from epypes.errors import NotComputed, PayloadError, ServiceError, run_call
 from epypes.hints import Roi
-from epypes.run import Run
+from epypes.run import CompGraphRunner, Run
+from epypes.store import Store
 from epypes_widgets import code, settings
-from epypes_widgets.controls import column
-from epypes_widgets.cuts import cuts_of, made_from
-from epypes_widgets.hand import Hand
-from epypes_widgets.history import history_of
-from epypes_widgets.latency import Latency, latency_of
+from epypes_widgets.cases import Cases, case_payloads, read_cases
+from epypes_widgets.control_set import ControlSet
+from epypes_widgets.controls import column, controls
+from epypes_widgets.history import StoredHistory, history_of
+from epypes_widgets.images import payloads
 from epypes_widgets.messages import Messages
-from epypes_widgets.picture import PictureView
-from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
-from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.screen import Screen
-from epypes_widgets.searching import Searching, told
+from epypes_widgets.search import Search, search_of
 from epypes_widgets.session import Session
-from epypes_widgets.static import static_html
-from epypes_widgets.still import Still
-from epypes_widgets.stored import StoredHistory
+from epypes_widgets.static import StaticOutput, static_html
+from epypes_widgets.target import tunable
 from epypes_widgets.tuning import Tuning
-from epypes_widgets.verdicts import Verdicts
+from epypes_widgets.values import json_values, setting_text
+from epypes_widgets.view import Latency, PictureView, use_subshell
+from epypes_widgets.worker import Worker
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from epypes_widgets.historyframe import HistoryFrame
+    from epypes.batch.optimize import Direction
+    from epypes.bundle.writeback import WriteBack
+    from epypes.graph import CompGraph
+    from epypes.service.remote.connection import Connection
+    from epypes_widgets.history_table import HistoryTable
 
 
 class Panel:
@@ -47,7 +51,7 @@ class Panel:
 
     Parameters
     ----------
-    hand
+    controls
         The controls.
     session
         Its runner is run by the panel.
@@ -55,8 +59,8 @@ class Panel:
         The token to show first; None for the best one.
     cases
         With their checks; their inputs are the payloads of the session.
-    stored
-        Where the history is kept, if it is.
+    store, name
+        Where each committed setting is kept, and under which name; None to keep nothing.
     search
         Of hyperparameters; None if there is no metric.
 
@@ -69,51 +73,52 @@ class Panel:
 
     def __init__(
         self,
-        hand: Hand,
+        controls: ControlSet,
         session: Session,
         token: str | None,
         cases: Checks,
-        stored: StoredHistory,
-        search: Searching | None,
+        store: str | Path | Store | None,
+        name: str | None,
+        search: Search | None,
     ) -> None:
-        self._hand, self._session, self._runner = hand, session, session.runner
+        self._controls, self._session, self._runner, self.search = controls, session, session.runner, search
+        cg: CompGraph = self._runner.cg
         self._history = history_of(self._runner)
-        if session.payloads:
-            self._history.use_images(tuple(value for film in session.payloads for value in film.values.values()))
-        self._column = column(self._runner.cg, hand.controls)
-        self._still = Still(self._static)
-        self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
-        self.search = search
-        self._messages = Messages(tuning, self.save, self.load, search)
-        self._verdicts = Verdicts(self._runner, cases, self._history, tuning)
-        handlers = self._verdicts.beside(self._messages.handlers)
-        view = PictureView(tuning.worker.later, handlers, tuning.report)
-        self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
-        self._cuts = cuts_of(hand)
-        tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
+        self._column = column(cg, controls.controls)
+        self._worker = worker = Worker(self._report)
+        view = PictureView(
+            lambda key, request, delay_s: worker.post(key, request, delay_s, is_work=False), self._report
+        )
+        self._static = StaticOutput(self._static_html)
+        self._screen = Screen(view, session, self._history, token, tuple(controls.thresholds))
+        self._screen.setup, self._screen.code = self._setup, self.code
+        self._stored: StoredHistory | None = None
+        if store is not None:
+            self._stored = StoredHistory(self._runner, store, name, self._history, self._screen.log)
+        self._tuning = Tuning(controls, session, self._history, worker, self._screen, self._static.update)
+        self._cases = Cases(self._runner, cases, self._history, self._tuning)
+        messages = Messages(self._tuning, self._cases, self.save, self.load, self.write_back, search)
+        view.handlers = messages.handlers
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
-        listen_beside_cells(self._widget)
-        tuning.begin()
-        self._stored = stored
-        stored.follow(self._history, self._screen.log)
-        self._verdicts.begin()
+        use_subshell(self._widget)
+        self._tuning.begin()
+        self._cases.begin()
 
     # -- values -------------------------------------------------------------------------------------------------
 
     @property
     def values(self) -> dict[str, Any]:
         """The values that the controls are at, by hyperparameter."""
-        return self._hand.values
+        return self._controls.values
 
     def __getitem__(self, name: str) -> Any:
-        return self._hand.control(name).read()[name]
+        return self._controls.control(name).read()[name]
 
     def __setitem__(self, name: str, value: Any) -> None:
-        self._require_open()
-        self._tuning.want({name: value})
+        self.set(**{name: value})
 
-    def set(self, **values: Any) -> None:
+    def set(self, /, **values: Any) -> None:
         """Move controls, all or none, and have the values computed.
 
         Raises
@@ -126,19 +131,21 @@ class Panel:
         self._require_open()
         self._tuning.want(values)
 
-    def reset(self, *names: str) -> None:
+    def reset(self, /, *names: str) -> None:
         """Set hyperparameters to the values that the runner had them frozen with; all without names."""
-        self._require_open()
         first = self._runner.first_hyperparameters
         for name in names:
-            self._hand.control(name)
-        self._tuning.want({name: first[name] for name in names or self._hand.values if name in first})
+            self._controls.control(name)
+        self.set(**{name: first[name] for name in names or self.values if name in first})
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""
-        first, place = self._runner.first_hyperparameters, self._session.place
-        name = code.name_of(place.owner, word=place.word)
-        return code.line(name, first, {**first, **self._hand.values}, self._hand.params, verb=place.verb)
+        first, runner = self._runner.first_hyperparameters, self._runner
+        values = {**first, **self.values}
+        if isinstance(runner, CompGraphRunner):
+            return code.line(code.name_of(runner), first, values, self._controls.params)
+        name = code.name_of(runner.connection, default="service")
+        return code.line(name, first, values, self._controls.params, verb="set")
 
     # -- results ------------------------------------------------------------------------------------------------
 
@@ -152,7 +159,7 @@ class Panel:
             None has completed.
         """
         if self._session.result is None:
-            text = f"No run of this panel has completed. {self._screen.error or 'Call wait(timeout_s) first.'}"
+            text = f"No run of this panel has completed. {self.error or 'Call wait(timeout_s) first.'}"
             raise NotComputed(self.token or "", text)
         return self._session.result
 
@@ -168,23 +175,23 @@ class Panel:
 
     @property
     def latency(self) -> Latency:
-        """How long the last frames took from the hand to the screen."""
-        return latency_of(self._screen.compute_ms, self._screen.view.to_screen_ms)
+        """How long the last frames took from a value to the screen."""
+        return self._screen.view.latency(self._screen.compute_ms)
 
     def wait(self, timeout_s: float) -> None:
         """Return when everything that was set has been computed and committed; TimeoutError if that takes longer.
 
-        What waits for a hand to let go, or with live off to be run, is not waited for.
+        What waits for a control to be released, or with live off to be run, is not waited for.
         """
-        self._tuning.worker.wait(timeout_s)
+        self._worker.wait(timeout_s)
 
     def check(self, timeout_s: float) -> CheckResult | None:
-        """Return what came of the cases with the values that were committed last; None if there is nothing to check.
+        """Return the result of the cases with the values that were committed last; None if there is nothing to check.
 
         TimeoutError if that takes longer.
         """
         self.wait(timeout_s)
-        return self._verdicts.wait(timeout_s)
+        return self._cases.wait(timeout_s)
 
     # -- looking ------------------------------------------------------------------------------------------------
 
@@ -197,8 +204,7 @@ class Panel:
     def token(self, token: str) -> None:
         self._require_open()
         self._runner.cg.require_token(token)
-        self._screen.change(token=self._screen.require_stage(token))
-        self._tuning.look()
+        self._tuning.look(token=self._screen.require_stage(token))
 
     @property
     def widget(self) -> Any:
@@ -208,13 +214,15 @@ class Panel:
     # -- remembering --------------------------------------------------------------------------------------------
 
     @property
-    def history(self) -> HistoryFrame:
+    def history(self) -> HistoryTable:
         """The values that were committed, a row each, with the pictures that they made; the pandas table is a copy."""
         return self._history.to_frame()
 
     @property
     def stored(self) -> pd.DataFrame:
         """What was committed under this panel's name, in earlier sessions too, as a pandas table; needs a store."""
+        if self._stored is None:
+            raise RuntimeError("This panel has no store. Name one: tune(runner, store='history.sqlite').")
         return self._stored.to_frame()
 
     def undo(self) -> bool:
@@ -235,7 +243,7 @@ class Panel:
         SettingsError
             With every reason why not.
         """
-        return settings.save(path, self._hand.movable, self._runner.cg, self._hand.params)
+        return settings.save(path, self._controls.movable, self._runner.cg, self._controls.params)
 
     def load(self, path: str | Path) -> None:
         """Set the values that are in a TOML file, all or none.
@@ -247,8 +255,37 @@ class Panel:
         ValueError
             A value is outside of its range.
         """
-        self._require_open()
-        self._tuning.want(settings.load(path, {**self._runner.hyperparameters, **self.values}))
+        self.set(**settings.load(path, {**self._runner.hyperparameters, **self.values}))
+
+    def write_back(self, dry_run: bool = False, timeout_s: float = 60.0) -> WriteBack:
+        """Write the values of the panel into the bundle of its service, when all that was set is set there.
+
+        Parameters
+        ----------
+        dry_run
+            Whether only to return what would change.
+        timeout_s
+            How long to wait for the values that were set before.
+
+        Raises
+        ------
+        TypeError
+            A runner is tuned, which has no bundle: promote it.
+        TimeoutError
+            The values were not set in time.
+        ServiceError
+            The service is gone, refuses a value or the changed bundle.
+        """
+        if isinstance(self._runner, CompGraphRunner):
+            raise TypeError("A runner has no bundle to write to. Promote it: ep.promote(runner, folder).")
+        if self._session.is_wanting and not self._tuning.is_live:
+            self._tuning.run()
+        self.wait(timeout_s)
+        left = self._session.wanted
+        if left:
+            reason = self.error or "They wait for a control to be released."
+            raise ServiceError(self._runner.connection.url, f"Not set in the service: {setting_text(left)}. {reason}")
+        return self._runner.connection.write_back(dry_run=dry_run)
 
     # -- itself -------------------------------------------------------------------------------------------------
 
@@ -260,27 +297,31 @@ class Panel:
         StillRunning
             A function did not return in time.
         """
-        for control in self._hand.controls:
+        for control in self._controls.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
-        with ExitStack() as last:  # all are closed, whichever does not stop in time; the last one first
-            last.callback(self._stored.close, timeout_s)
+        with ExitStack() as last:  # all are closed, also if one does not stop in time; the last one first
+            if self._stored is not None:
+                last.callback(self._stored.close, timeout_s)
             if self.search is not None:
                 self.search.stop()
                 last.callback(self.search.close, timeout_s)
             last.callback(self._tuning.close, timeout_s)
-            last.callback(self._verdicts.close, timeout_s)
+            last.callback(self._cases.close, timeout_s)
 
     def _require_open(self) -> None:
-        if self._tuning.worker.closed:
+        if self._worker.closed:
             raise RuntimeError("This panel is closed. Make a new one: tune(runner).")
 
+    def _report(self, error: BaseException) -> None:
+        self._tuning.report(error)
+
     def __repr__(self) -> str:
-        worker = self._tuning.worker
-        state = "closed" if worker.closed else "failed" if self.error else "up to date"
-        if state == "up to date" and not worker.idle:
+        state = "closed" if self._worker.closed else "failed" if self.error else "up to date"
+        if state == "up to date" and self._worker.is_pending("compute"):
             state = "computing"
-        return f"<Panel: {len(self.values)} hyperparameters, shows {str(self.token)!r:.30}; {state}>"
+        shows = "" if self.token is None else f", shows {self.token!r:.30}"
+        return f"<Panel: {len(self.values)} hyperparameters{shows}; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
         bundle: dict[str, Any] = self._widget._repr_mimebundle_() or {}
@@ -290,9 +331,9 @@ class Panel:
         from IPython.display import display
 
         display(self._repr_mimebundle_(), raw=True)
-        self._still.display()
+        self._static.display()
 
-    def _static(self) -> str:
+    def _static_html(self) -> str:
         run = self._session.result
         if run is None:
             return ""
@@ -303,21 +344,130 @@ class Panel:
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
-        films, params, values = self._session.payloads, self._hand.params, plain_values(self.values)
+        images, values = self._session.payloads, json_values(self.values)
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
-            "images": [{"index": index, "title": film.title} for index, film in enumerate(films)],
+            "images": [{"index": index, "title": image.title} for index, image in enumerate(images)],
             "live": self._tuning.is_live,
-            "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
+            "cuts": [{"token": token, "names": names} for token, names in self._controls.thresholds.items()],
             "rois": [
-                {"name": name, "token": param.on, "cuts_out": made_from(self._runner.cg, name)}
-                for name, param in params.items()
+                {"name": name, "token": param.on, "cuts_out": _made_from(self._runner.cg, name)}
+                for name, param in self._controls.params.items()
                 if isinstance(param, Roi)
             ],
             "promote_to": proposal(self.token),
-            "writes_back": self._session.place.is_written_back,
+            "writes_back": self._session.is_service,
             "settings": list(settings.names(".")),
-            "optimise": told(self.search),
+            "optimise": None if self.search is None else self.search.content(),
         }
-        return content, [film.thumbnail for film in films]
+        return content, [image.thumbnail for image in images]
+
+
+def _made_from(cg: CompGraph, token: str) -> list[str]:
+    """Return the tokens that depend on a token: on a picture that it has cut out, it means something else."""
+    found = {token}
+    for function in cg.functions:
+        if found.intersection(cg.func_inputs(function)):
+            found.update(cg.func_outputs(function))
+    return sorted(found)
+
+
+def tune(
+    tuned: CompGraphRunner | Connection,
+    /,
+    *,
+    images: Iterable[Any] | None = None,
+    cases: Any = None,
+    token: str | None = None,
+    metric: Any = None,
+    direction: Direction = "maximize",
+    store: str | Path | Store | None = None,
+    name: str | None = None,
+    **hints: Any,
+) -> Panel:
+    """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
+
+    Parameters
+    ----------
+    tuned
+        A runner that has been run, so that there is a payload, unless ``images`` are given. Or what ``ep.connect``
+        has returned: then the picture follows the service's own events, values are set there, with their revision, and
+        what other clients set at the same time is never overwritten unseen.
+    images
+        Test images to switch between: values of the one free source token, or dicts by token. A service has none.
+    cases
+        A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
+        shows whether it passes with the values that were committed last. A service has none.
+    token
+        The token whose picture is shown at first; without, the last sink token that is an image, else the last
+        image.
+    metric, direction
+        What the "Optimise" button makes as large (``"maximize"``) or as small (``"minimize"``) as it can, within the
+        ranges of the controls: ``metric(tokens, case)``, or the name of a token that is a number. Without, there is no
+        such button. Looked at are the cases, else the images, else the last payload. The search runs beside the panel;
+        "Use best" sets what it has found, and undo goes back.
+    store
+        Where each committed setting is kept: a SQLite file, a database's URL, or an ``ep.Store``. Nothing waits for it.
+    name
+        The name of the series there; without, those of the sink tokens.
+    hints
+        By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
+        Without, the annotation of the function that takes it counts, then the table of OpenCV's and scikit-image's
+        parameters, then its value; what can't be moved is shown. A hyperparameter called as one of the above gets
+        its hint from its annotation.
+
+    Returns
+    -------
+    Panel
+        As the last expression of a cell it shows itself. Running the cell again makes a new panel, which goes on from
+        the runner's values and its history.
+
+    Raises
+    ------
+    PayloadError
+        The runner has not been run and there are no images, or they don't fit its free source tokens; or there are
+        images for a service.
+    Exception
+        Whatever a function raises on the first image, if the runner has not been run.
+    UnknownName
+        A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
+    ScaleError, ImageFileError
+        The cases can't be understood, or the file of an input can't be read.
+    TypeError, ValueError
+        There are images and cases; a hint can't be read, or the hyperparameter's value lies outside of it.
+    ServiceError
+        The service is gone.
+    StoreError
+        There can be no such database. One that is away for now is reported in the panel's log.
+
+    Examples
+    --------
+    >>> from epypes import CompGraph, CompGraphRunner
+    >>> runner = CompGraphRunner(CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 1})
+    >>> run = runner.run(x=2)
+    >>> panel = tune(runner, y=(0, 10))
+    >>> panel["y"] = 5
+    >>> panel.wait(10)
+    >>> panel.result["total"]
+    7
+    >>> panel.code()
+    'runner.rerun(y=5)'
+    """
+    runner = tunable(tuned)
+    if token is not None:
+        runner.cg.require_token(token)
+    found = read_cases(runner, images, cases)
+    given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
+    session = Session(runner, given)
+    if session.is_service and given:
+        runner.trial({}, payload=given[0].values)  # refuses it
+    elif runner.last is None and not given and not session.is_service:
+        free = runner.free_source_tokens
+        text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
+        raise PayloadError(free, text)
+    control_set = ControlSet(controls(runner, hints))
+    looked_at: list[Any] | None = [case for case, _ in found] or [payload.values for payload in given] or None
+    search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
+    session.begin()
+    return Panel(control_set, session, token, found, store, name, search)

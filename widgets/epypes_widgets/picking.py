@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import threading
 import weakref
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any, Final
 
 import anywidget
@@ -16,28 +15,27 @@ from epypes.batch.grid import identity
 from epypes.batch.mapping import SweepResult
 from epypes.display.text import cut
 from epypes.errors import EpypesError
-from epypes_widgets.route import listen_beside_cells
-from epypes_widgets.still import Still
-from epypes_widgets.values import is_same, said
+from epypes_widgets.static import StaticOutput
+from epypes_widgets.values import is_same, setting_text
+from epypes_widgets.view import script, styles, use_subshell
 from epypes_widgets.worker import Worker
 
 _LOG: Final = logging.getLogger(__name__)
-_HERE: Final = Path(__file__).parent
 # More are no overview, and each is a picture of up to 5 KB.
-_MOST_TILES: Final = 400
+_MAX_TILES: Final = 400
 _TEXT_CHARACTERS: Final = 160
-# Whoever else changes the runner has done so after a few attempts.
-_ATTEMPTS: Final = 5
-_STILL_S: Final = 0.5
+# A cell that changes the runner has done so after a few attempts.
+_MAX_ATTEMPTS: Final = 5
+_STATIC_S: Final = 0.5
 
 Message = Mapping[str, Any]
 
 
 class SheetView(anywidget.AnyWidget):
-    """The contact sheet in the browser; to its kernel it says ``ready``, ``pick`` and ``show``."""
+    """The contact sheet in the browser; to the kernel it sends ``ready``, ``pick`` and ``show``."""
 
-    _esm = (_HERE / "picking.js").read_text(encoding="utf-8")
-    _css = (_HERE / "picking.css").read_text(encoding="utf-8")
+    _esm = script("picker.js")
+    _css = styles("picker.css")
 
 
 def pick(result: SweepResult, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Picker:
@@ -76,17 +74,15 @@ class Picker:
         self.result, self._sheet = result, sheet
         # The first place of each setting.
         self._places = {self._key(result[place].setting): place for place in reversed(range(len(result)))}
-        self._lock = threading.Lock()
-        self._wanted: int | None = None
         self._clicked: int | None = None
         self._text = ""
         self._is_seen = False
-        self._worker = Worker(self._compute, self._failed, "epypes-pick")
-        self._still = Still(lambda: sheet_page(self._sheet, self.chosen))
+        self._worker = Worker(self._failed, "epypes-pick")
+        self._static = StaticOutput(lambda: sheet_page(self._sheet, self.chosen))
         self._view = SheetView()
         self._view.on_msg(self._answer)
-        listen_beside_cells(self._view)
-        # The runner must not keep alive what nobody looks at any more.
+        use_subshell(self._view)
+        # The runner must not keep alive a picker that is not shown any more.
         changed = weakref.WeakMethod(self._runner_changed)
         self._unwatch = weakref.finalize(self, result.runner.watch(lambda: (method := changed()) and method()))
 
@@ -105,7 +101,7 @@ class Picker:
 
     @property
     def text(self) -> str:
-        """What is said below the sheet: what was set, or why nothing was."""
+        """The text below the sheet: what was set, or why nothing was."""
         return self._text
 
     @property
@@ -123,9 +119,7 @@ class Picker:
         """
         if not 0 <= place < len(self.result):
             raise IndexError(f"There is no outcome {place}; the sweep has {len(self.result)}.")
-        with self._lock:
-            self._wanted = place
-        self._worker.ask()
+        self._worker.post("pick", partial(self._pick, place))
 
     def wait(self, timeout_s: float) -> None:
         """Return when the runner has what was chosen.
@@ -150,22 +144,18 @@ class Picker:
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
-    def _compute(self, _asked_ns: int) -> None:
-        with self._lock:
-            place, self._wanted = self._wanted, None
-        if place is not None:
-            self._tell({"kind": "state", "chosen": place, "busy": True, "text": ""})
-            self._clicked, self._text = place, self._set(self.result[place].setting)
+    def _pick(self, place: int) -> None:
+        self._tell({"kind": "state", "chosen": place, "busy": True, "text": ""})
+        self._clicked, self._text = place, self._set(self.result[place].setting)
         self._tell_state()
-        self._worker.later("still", _STILL_S, self._still.update)
 
     def _set(self, setting: Mapping[str, Any]) -> str:
-        """Set the runner and run what is stale, all or nothing; return what is to be said."""
-        runner, named = self.result.runner, _named(setting)
+        """Set the runner and run what is stale, all or nothing; return the text for it."""
+        runner, named = self.result.runner, setting_text(setting)
         if runner.last is None:
             runner.set(**setting)
             return f"Set: {named}. Nothing has been run yet."
-        for _ in range(_ATTEMPTS):
+        for _ in range(_MAX_ATTEMPTS):
             run = runner.trial(setting)
             if run.failure is not None:
                 return f"Not set, since it fails: {run.failure}"
@@ -180,7 +170,7 @@ class Picker:
         self._tell_state()
 
     def _runner_changed(self) -> None:
-        self._worker.ask()
+        self._worker.post("state", self._tell_state)
 
     # -- the view -----------------------------------------------------------------------------------------------
 
@@ -204,12 +194,12 @@ class Picker:
             self._view.send(content, list(buffers))
 
     def _tell_state(self) -> None:
-        self._tell(
-            {"kind": "state", "chosen": self.chosen, "busy": False, "text": cut(self._text, 2 * _TEXT_CHARACTERS)}
-        )
+        text = cut(self._text, 2 * _TEXT_CHARACTERS)
+        self._tell({"kind": "state", "chosen": self.chosen, "busy": False, "text": text})
+        self._worker.post("static", self._static.update, _STATIC_S, is_work=False)
 
     def _tell_sheet(self) -> None:
-        shown = self._sheet.first(_MOST_TILES)
+        shown = self._sheet.first(_MAX_TILES)
         pictures: dict[bytes, int] = {}
         blocks = [_block(block, self.result, pictures) for block in shown.blocks]
         content = {
@@ -240,7 +230,7 @@ class Picker:
         from IPython.display import display
 
         display(self._repr_mimebundle_(), raw=True)
-        self._still.display()
+        self._static.display()
 
 
 def _block(block: Block, result: SweepResult, pictures: dict[bytes, int]) -> dict[str, Any]:
@@ -256,11 +246,7 @@ def _tile(tile: Tile, result: SweepResult, pictures: dict[bytes, int]) -> dict[s
         "label": tile.label,
         "text": cut(tile.text, _TEXT_CHARACTERS),
         "failed": tile.has_failed,
-        "setting": _named(result[tile.place].setting),
+        "setting": setting_text(result[tile.place].setting),
         "picture": None if shown is None else pictures.setdefault(shown.data, len(pictures)),
         "media_type": "" if shown is None else shown.media_type,
     }
-
-
-def _named(setting: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {said(value)}" for name, value in setting.items())

@@ -1,14 +1,11 @@
-"""What becomes of a promotion that was asked for by a button?"""
+"""Promotion by a button, and the values of a service written back: one job at a time, on a thread of its own."""
 
 from __future__ import annotations
 
-import io
 import logging
 import re
-import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -20,118 +17,140 @@ from epypes.wording import counted
 from epypes_widgets.values import listed
 
 _LOG: Final = logging.getLogger(__name__)
-_PRINTED_CHARACTERS: Final = 4_000
 _NOT_IN_A_NAME: Final = re.compile(r"[^\w.-]+")
-
-State = Literal["running", "done", "refused"]
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How far a promotion has come.
-
-    Attributes
-    ----------
-    state
-        ``"running"``, ``"done"`` or ``"refused"``.
-    text
-        For the user, on several lines if there are several reasons.
-    to
-        The folder, as it was named.
-    printed
-        What the functions printed meanwhile, its end if it is long; for the log.
-    """
-
-    state: State
-    text: str
-    to: str
-    printed: str = ""
+_DIFF_CHARACTERS: Final = 20_000
+_DIGEST_CHARACTERS: Final = 12
 
 
-class Promotion:
-    """Promotes runners on a thread of its own, one at a time.
+class Job:
+    """Work on a thread of its own, one at a time.
 
     Parameters
     ----------
-    report
-        Is called with each ``Outcome``, the first on the caller's thread, the last on the promotion's. What it raises
-        is logged.
-
-    Notes
-    -----
-    The runner's own runs are left alone: its graph is run anew, with its hyperparameters and its last payload, since
-    its last run may be a partial one and the next one may begin meanwhile.
+    name
+        Of the thread.
     """
 
-    def __init__(self, report: Callable[[Outcome], None]) -> None:
-        self._report = report
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._ended.set()
-        self._last: Outcome | None = None
 
     @property
     def is_running(self) -> bool:
-        """Whether a promotion has begun and not ended."""
+        """Whether work has begun and not ended."""
         return not self._ended.is_set()
 
-    @property
-    def last(self) -> Outcome | None:
-        """What was reported last; None before the first."""
-        return self._last
-
-    def start(self, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None = None) -> bool:
-        """Begin a promotion and return at once; False, and nothing else, if one is running.
-
-        Parameters
-        ----------
-        runner
-            Has been run.
-        to
-            The folder of the bundle, as for ``ep.promote``; ``~`` is the home folder.
-        outputs
-            The tokens that the service answers with; the sink tokens without.
-        """
+    def run(self, work: Callable[[], object]) -> bool:
+        """Begin work and return at once; False, and nothing else, if some is running."""
         with self._lock:
             if self.is_running:
                 return False
             self._ended.clear()
-        self._tell(Outcome("running", f"Promoting to {to} ...", to))
-        thread = threading.Thread(target=self._work, args=(runner, to, outputs), name="epypes-promotion", daemon=True)
-        try:
-            thread.start()
-        except RuntimeError as error:  # no more threads
-            self._end(Outcome("refused", f"Not promoted: {error}.", to))
+        threading.Thread(target=self._work, args=(work,), name=self._name, daemon=True).start()
         return True
 
-    def wait(self, timeout_s: float) -> Outcome | None:
-        """Return the outcome once nothing is running; TimeoutError if that takes longer."""
+    def wait_end(self, timeout_s: float) -> None:
+        """Return once nothing is running; TimeoutError if that takes longer."""
         if not self._ended.wait(timeout_s):
-            raise TimeoutError(f"The promotion did not end within {timeout_s:g} s.")
-        return self._last
+            raise TimeoutError(f"{self._name} did not end within {timeout_s:g} s.")
 
-    def _work(self, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -> None:
-        printed = io.StringIO()
+    def _work(self, work: Callable[[], object]) -> None:
         try:
-            with _output_of_this_thread(printed):
-                state, text = _promoted(runner, to, outputs)
-        except BaseException as error:  # a function of the user's may raise anything, SystemExit too
-            state, text = "refused", f"Not promoted: {_told(error)}"
-        said = printed.getvalue()[-_PRINTED_CHARACTERS:]
-        if said:
-            _LOG.info("Printed while promoting to %s:\n%s", to, said)
-        self._end(Outcome(state, text, to, said))
+            work()
+        finally:
+            self._ended.set()
 
-    def _end(self, outcome: Outcome) -> None:
-        self._tell(outcome)
-        self._ended.set()
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How far a promotion, or writing back, has come.
+
+    Attributes
+    ----------
+    state
+        ``"running"``, ``"diff"`` when it is shown what would change, ``"done"`` or ``"refused"``.
+    text
+        For the user, on several lines if there are several reasons.
+    to
+        The folder that is promoted to, as it was named.
+    diff
+        What writing back would change, or has changed.
+    """
+
+    state: Literal["running", "diff", "done", "refused"]
+    text: str
+    to: str = ""
+    diff: str = ""
+
+
+class ReportingJob(Job):
+    """A job that reports its outcomes.
+
+    Parameters
+    ----------
+    name
+        Of the thread.
+    report
+        Is called with each ``Outcome``, on the job's thread. What it raises is logged.
+    """
+
+    def __init__(self, name: str, report: Callable[[Outcome], None]) -> None:
+        super().__init__(name)
+        self._report = report
+        self._last: Outcome | None = None
+
+    def start(self, running: Outcome, work: Callable[[], Outcome]) -> bool:
+        """Report what is running, then do it, and report what came of it; return at once, False if some is running."""
+
+        def report_both() -> None:
+            self._tell(running)
+            try:
+                outcome = work()
+            except BaseException as error:  # a function of the user's may raise anything, SystemExit too
+                outcome = Outcome("refused", _text_of(error), running.to)
+            self._tell(outcome)
+
+        return self.run(report_both)
+
+    def wait(self, timeout_s: float) -> Outcome | None:
+        """Return what was reported last once nothing is running; TimeoutError if that takes longer."""
+        self.wait_end(timeout_s)
+        return self._last
 
     def _tell(self, outcome: Outcome) -> None:
         self._last = outcome
         try:
             self._report(outcome)
         except Exception:
-            _LOG.exception("The outcome of the promotion to %s could not be shown", outcome.to)
+            _LOG.exception("The outcome of %s could not be shown", self._name)
+
+
+def _text_of(error: BaseException) -> str:
+    notes = "".join(f"\n{note}" for note in getattr(error, "__notes__", ()))
+    text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error}"
+    return text if isinstance(error, PromotionRefused) else f"Not done: {text}{notes}"
+
+
+def start_promotion(job: ReportingJob, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None = None) -> bool:
+    """Begin to promote a runner and return at once; False, and nothing else, if a promotion is running.
+
+    The runner's own runs are left alone: its graph is run anew, with its hyperparameters and its last payload, since
+    its last run may be a partial one and the next one may begin meanwhile.
+
+    Parameters
+    ----------
+    job
+        Reports the outcome.
+    runner
+        Has been run.
+    to
+        The folder of the bundle, as for ``ep.promote``; ``~`` is the home folder.
+    outputs
+        The tokens that the service answers with; the sink tokens without.
+    """
+    return job.start(Outcome("running", f"Promoting to {to} ...", to), lambda: _promoted(runner, to, outputs))
 
 
 def proposal(token: str | None) -> str:
@@ -146,66 +165,43 @@ def proposal(token: str | None) -> str:
     return f"services/{name or 'graph'}"
 
 
-def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -> tuple[State, str]:
+def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -> Outcome:
     if not to.strip():
-        return "refused", "Not promoted: name a folder, such as services/edges."
-    try:
-        folder = Path(to.strip()).expanduser()
-        bundle = promote(_complete(runner), folder, outputs=outputs)
-    except PromotionRefused as refusal:
-        return "refused", str(refusal)
+        return Outcome("refused", "Not promoted: name a folder, such as services/edges.", to)
+    own, last = runner, runner.last
+    if last is not None:
+        own = CompGraphRunner(
+            runner.cg, runner.hyperparameters, guard=runner.guard, check_mutation=runner.check_mutation
+        )
+        own.run(**{token: last[token] for token in own.free_source_tokens})
+    bundle = promote(own, Path(to.strip()).expanduser(), outputs=outputs)
     samples = counted(len(bundle.samples), "sample")
     names = f"output{'s' * (len(bundle.settings.outputs) != 1)} {listed(bundle.settings.outputs)}"
-    return "done", f"Promoted to {to.strip()}: {names}; {samples} replayed in a fresh process, identical."
+    text = f"Promoted to {to.strip()}: {names}; {samples} replayed in a fresh process, identical."
+    return Outcome("done", text, to)
 
 
-def _complete(runner: CompGraphRunner) -> CompGraphRunner:
-    """Return a runner like this one that has run everything on the last payload; as it is if there is none."""
-    last = runner.last
-    if last is None:
-        return runner
-    # One function after another: what they print is told from other output by its thread.
-    own = CompGraphRunner(runner.cg, runner.hyperparameters, guard=runner.guard, check_mutation=runner.check_mutation)
-    own.run(**{token: last[token] for token in own.free_source_tokens})
-    return own
+def start_write_back(job: ReportingJob, write: Callable[[bool], Any], *, dry_run: bool) -> bool:
+    """Begin to write the values of a service back into its bundle and return at once; False if that is running.
+
+    Parameters
+    ----------
+    job
+        Reports the outcome.
+    write
+        Is called with ``dry_run``; its answer has ``diff`` and ``digest``.
+    dry_run
+        Whether to show what would change; nothing is written then.
+    """
+    text = "Looking at what would change ..." if dry_run else "Writing, and replaying the samples ..."
+    return job.start(Outcome("running", text), lambda: _written(write(dry_run), dry_run))
 
 
-def _told(error: BaseException) -> str:
-    notes = "".join(f"\n{note}" for note in getattr(error, "__notes__", ()))
-    text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error}"
-    return f"{text}{notes}"
-
-
-class _Routed:
-    """A stream that keeps what one thread writes; all others go on writing where they did."""
-
-    def __init__(self, stream: Any, kept: io.StringIO) -> None:
-        self.stream, self._kept = stream, kept
-        self._thread: int | None = threading.get_ident()
-
-    def end(self) -> None:
-        """Pass everything on from now: an identity of a thread that has ended may be given to another."""
-        self._thread = None
-
-    def write(self, text: str) -> int:
-        stream = self._kept if threading.get_ident() == self._thread else self.stream
-        return int(stream.write(text) or 0)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.stream, name)
-
-
-@contextmanager
-def _output_of_this_thread(kept: io.StringIO) -> Iterator[None]:
-    """Keep what this thread prints; contextlib's redirection would take the output of the user's cells too."""
-    routed = {name: _Routed(getattr(sys, name), kept) for name in ("stdout", "stderr")}
-    for name, stream in routed.items():
-        setattr(sys, name, stream)
-    try:
-        yield
-    finally:
-        for name, stream in routed.items():
-            stream.end()
-            # Somebody else may have redirected it meanwhile, and will put ours back: it passes everything on.
-            if getattr(sys, name) is stream:
-                setattr(sys, name, stream.stream)
+def _written(answer: Any, dry_run: bool) -> Outcome:
+    diff, digest = str(answer.diff), str(answer.digest)[:_DIGEST_CHARACTERS]
+    if not diff:
+        return Outcome("done", f"pipeline.toml has these values already; the bundle is {digest}.")
+    diff = diff if len(diff) <= _DIFF_CHARACTERS else f"{diff[:_DIFF_CHARACTERS]}\n..."
+    if dry_run:
+        return Outcome("diff", "This would change in pipeline.toml.", diff=diff)
+    return Outcome("done", f"Written to pipeline.toml and replayed; the bundle is {digest} now.", diff=diff)

@@ -1,107 +1,167 @@
-"""What does the view of a panel know, and what is it told?"""
+"""What the view of a panel shows: the stages, the picture, what failed, the history, and all of it for a new view."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
 from operator import is_
 from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
-from epypes_widgets.history import Entry, History, changed
-from epypes_widgets.looking.stages import Stage, is_fresh, stages, states
-from epypes_widgets.picture import PictureView
-from epypes_widgets.plain import plain_values
+from epypes_widgets.history import History, changed
 from epypes_widgets.session import Session
-from epypes_widgets.shown import Shown, remember_shown, shown_before
+from epypes_widgets.stages import Stage, best_stage, stages, states
+from epypes_widgets.target import Tunable
+from epypes_widgets.values import json_values
+from epypes_widgets.view import PictureView
 
-_MOST_ENTRIES: Final = 40
-_MOST_LINES: Final = 100
+_MAX_ENTRIES: Final = 40
+_MAX_LINES: Final = 100
 _LINE_CHARACTERS: Final = 500
 _ERROR_CHARACTERS: Final = 2_000
 
 
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What the picture is compared with.
+
+    Attributes
+    ----------
+    kind
+        ``"default"`` for the first values of all hyperparameters, ``"history"`` for committed ones, ``"stage"`` for
+        another token of the same run.
+    number
+        Of the entry of the history.
+    token
+        Of the stage.
+    """
+
+    kind: str
+    number: int = 0
+    token: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What is on the screen; replaced as a whole.
+
+    Attributes
+    ----------
+    token
+        Whose picture is the big one; None before the first run.
+    pinned
+        Whose pictures are shown small beneath it.
+    comparison
+        None if it is not compared.
+    has_histogram
+        Whether the histogram of the picture is shown.
+    cut
+        The tokens whose histograms are shown with thresholds on them.
+    """
+
+    token: str | None = None
+    pinned: tuple[str, ...] = ()
+    comparison: Comparison | None = None
+    has_histogram: bool = False
+    cut: tuple[str, ...] = ()
+
+    @property
+    def other(self) -> str:
+        """The stage that the big picture is compared with; empty if it is none."""
+        return self.comparison.token if self.comparison is not None and self.comparison.kind == "stage" else ""
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The tokens that must be computed, the big picture's first."""
+        cut = self.cut if self.has_histogram else ()
+        return tuple(dict.fromkeys(token for token in (self.token, self.other, *self.pinned, *cut) if token))
+
+    def within(self, stages: Sequence[Stage], run: Run) -> Shown:
+        """Return what of this can be shown with these stages; another big picture if this one can't."""
+        known = {stage.token for stage in stages}
+        token = self.token if self.token in known else best_stage(run, stages)
+        pinned = tuple(name for name in self.pinned if name in known)
+        comparison = self.comparison if not self.other or self.other in known else None
+        return replace(self, token=token, pinned=pinned, comparison=comparison)
+
+
+# A cell that is run again makes a new panel, which goes on with what the last one of the runner showed.
+_last_shown: WeakKeyDictionary[Tunable, Shown] = WeakKeyDictionary()
+
+
 class Screen:
-    """The view, and all that a view which is mounted later has to be told again.
+    """The view, and all that a view which is mounted later must get again.
 
     Parameters
     ----------
     view
-        What is told.
+        Gets the messages.
     session
         Its runs are shown.
     history
         Its entries are listed.
     asked
         A token that is a stage in any case; None for none.
-    setup
-        Returns what a view has to know from the start, with the bytes of its pictures.
-    code
-        Returns the line of code that does what the hand has done.
+    cut
+        The tokens that thresholds cut; their histograms are shown.
 
     Attributes
     ----------
+    setup
+        Returns what a view has to know from the start, with the bytes of its pictures.
+    code
+        Returns the line of code that sets what the user has set.
     shown
         What is wanted to be seen.
     stages
         The tokens that can be.
     error
         What failed with the last values; empty if nothing did.
-    told
-        The number of the newest entry of the history that the view was told of.
+    listed
+        The number of the newest entry of the history that the view has got.
     compute_ms
         How long the run that is shown took; None before the first.
-    is_closed
-        Whether nothing follows the hand any more.
     """
 
+    setup: Callable[[], tuple[dict[str, Any], list[bytes]]]
+    code: Callable[[], str]
+
     def __init__(
-        self,
-        view: PictureView,
-        session: Session,
-        history: History,
-        asked: str | None,
-        setup: Callable[[], tuple[dict[str, Any], list[bytes]]],
-        code: Callable[[], str],
+        self, view: PictureView, session: Session, history: History, asked: str | None, cut: tuple[str, ...]
     ) -> None:
         self.view = view
-        before = shown_before(session.runner)
-        self.shown = Shown(asked or before.token, before.pinned)
+        before = _last_shown.get(session.runner, Shown())
+        self.shown = Shown(asked or before.token, before.pinned, has_histogram=bool(cut), cut=cut)
         self.stages: tuple[Stage, ...] = ()
         self.error = ""
         self.compute_ms: float | None = None
-        self._session, self._history, self._asked, self._setup, self._code = session, history, asked, setup, code
+        self.listed = 0
+        self._session, self._history, self._asked = session, history, asked
         self._lock = threading.Lock()
         self._seq = count(1).__next__
-        self._failure: dict[str, Any] | None = None
-        self._noted, self._waits = "", False
-        self.is_closed = False
+        self._failure: dict[str, Any] = {}
+        self._note = {"text": "", "waits": False}
+        self._is_closed = False
         self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
-        self._seen_token: str | None = None
-        # Held while the history is told, so that what is told last is the newest.
-        self._telling = threading.Lock()
-        self._told: set[int] = set()
-        self.told = 0
+        # Held while the history is sent, so that what is sent last is the newest.
+        self._listing = threading.Lock()
+        self._pictured: set[int] = set()
         self._log: list[dict[str, str]] = []
-        self._verdicts: dict[str, Any] | None = None
+        self.verdicts: dict[str, Any] | None = None
+        self.change()
 
     # -- what is shown ------------------------------------------------------------------------------------------
 
-    def change(self, **parts: Any) -> Shown:
-        """Replace parts of what is shown, and return it."""
+    def change(self, **parts: Any) -> None:
+        """Replace parts of what is shown."""
         with self._lock:
-            self.shown = replace(self.shown, **parts)
-            remember_shown(self._session.runner, self.shown)
-            return self.shown
-
-    @property
-    def _pictures(self) -> set[str]:
-        return {stage.token for stage in self.stages if stage.is_picture}
+            self.shown = _last_shown[self._session.runner] = replace(self.shown, **parts)
 
     def require_stage(self, token: object) -> str:
         """Return the token; LookupError if it is no stage."""
@@ -109,7 +169,7 @@ class Screen:
             raise LookupError(f"{token!r} has no picture here.")
         return str(token)
 
-    # -- what is told, on the worker's thread -------------------------------------------------------------------
+    # -- on the worker's thread ---------------------------------------------------------------------------------
 
     def follow(self, run: Run) -> None:
         """Offer the stages that a completed run has; keep what is shown if it is among them."""
@@ -118,7 +178,7 @@ class Screen:
             is_new, self.stages = found != self.stages, found
             self.shown = self.shown.within(found, run)
         if is_new:
-            self.tell_setup()
+            self.send_setup()
 
     def show(self, run: Run, changed_ns: int, *, failed: Run | None = None) -> None:
         """Show a completed run; ``failed`` is the newer one that did not complete."""
@@ -126,12 +186,10 @@ class Screen:
         if shown.token is None:  # a graph may have no tokens
             return
         if failed is None:
-            self._failure, self.error = None, ""
-            if self._waits:
+            self._failure, self.error = {}, ""
+            if self._note["waits"]:
                 self.note("")
             self.compute_ms = run.report.total_ns / 1e6
-        if is_fresh(run, shown.token):
-            self._seen_token = shown.token
         frame = make_frame(
             run,
             shown.token,
@@ -145,40 +203,22 @@ class Screen:
         )
         self.view.frames.offer(frame)
 
-    def token_in(self, run: Run) -> str | None:
-        """Return the token that is seen in a run: the one before, while one chosen just now is not computed."""
-        token = self.shown.token
-        return token if token is None or is_fresh(run, token) else self._seen_token
-
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
-        """Say what failed, and where; the picture stays."""
+        """Say what failed, and where; the picture stays. An empty text ends that."""
         self.error = text = text[:_ERROR_CHARACTERS]
         self._failure = {"seq": self._seq(), "text": text, "function": function, "names": list(names)}
         self.view.tell("error", self._failure)
 
-    def note(self, text: str) -> None:
-        """Say something that is no failure; it stays until something else is said, or nothing."""
-        if text != self._noted:
-            self._noted, self._waits = text, False
-            self._tell_note()
+    def note(self, text: str, *, waits: bool = False) -> None:
+        """Say something that is no failure; it stays until another text, or none.
 
-    def wait(self, text: str) -> None:
-        """Say what is waited for, which is no failure: in the picture's place if there is none yet."""
-        if self.error:
-            self._failure, self.error = None, ""
-            self.view.tell("error", {"seq": self._seq(), "text": "", "function": "", "names": []})
-        self._noted, self._waits = text, True
-        self._tell_note()
-
-    def close(self, text: str) -> None:
-        """Say that nothing follows the hand any more."""
-        self.is_closed = True
-        self.tell_setup()
-        self.tell_history()
-        self.note(text)
-
-    def _tell_note(self) -> None:
-        self.view.tell("note", {"text": self._noted, "waits": self._waits})
+        What is waited for stands in the picture's place if there is none yet.
+        """
+        if waits and self.error:
+            self.fail("")
+        if self._note != {"text": text, "waits": waits}:
+            self._note = {"text": text, "waits": waits}
+            self.view.tell("note", self._note)
 
     def refers_to(self, key: object, payload: Sequence[Any]) -> bool:
         """Whether the picture is compared with this, computed from the very values of this payload."""
@@ -192,54 +232,66 @@ class Screen:
         self._reference = {"seq": self._seq(), "label": label, "picture": described}, (data,) if data else ()
         self.view.tell("reference", *self._reference)
 
-    def refer_anew(self) -> None:
-        """Have what the picture is compared with computed again: a cell has run it, or set what is default."""
+    def refer_anew(self, *, to_nothing: bool = False) -> None:
+        """Have what the picture is compared with computed again; or compare with nothing, or another stage."""
         self._referred = (None, ())
+        if to_nothing:
+            self._reference = None
 
-    def refer_to_nothing(self) -> None:
-        """Compare with nothing, or with another stage, which comes with each frame."""
-        self._referred, self._reference = (None, ()), None
+    @property
+    def _pictures(self) -> set[str]:
+        return {stage.token for stage in self.stages if stage.is_picture}
 
-    # -- what is told, on any thread ----------------------------------------------------------------------------
+    # -- on any thread ------------------------------------------------------------------------------------------
 
-    def tell_setup(self) -> None:
-        """Tell all that a new view must know, but for the picture."""
-        setup, buffers = self._setup()
+    def send_setup(self) -> None:
+        """Send all that a new view must know, but for the picture."""
+        setup, buffers = self.setup()
         shown = self.shown
         setup |= {
             "stages": [{"token": stage.token, "is_picture": stage.is_picture} for stage in self.stages],
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
-            "closed": self.is_closed,
+            "closed": self._is_closed,
         }
         self.view.tell("setup", setup, buffers)
 
-    def tell_history(self) -> None:
-        """Tell the last entries; a thumbnail goes to a view once, and is empty from then on."""
-        with self._telling:
+    def send_history(self) -> None:
+        """Send the last entries; a thumbnail goes to a view once, and is empty from then on."""
+        with self._listing:
             entries, current = self._history.entries, self._history.current
             pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
-            pairs = pairs if len(pairs) <= _MOST_ENTRIES else [pairs[0], *pairs[1 - _MOST_ENTRIES :]]
-            self.told = len(entries) and entries[-1].number
-            content = [_entry(before, entry, is_current=entry is current) for before, entry in pairs]
-            buffers = [b"" if entry.number in self._told else _thumbnail(entry) for _, entry in pairs]
+            pairs = pairs if len(pairs) <= _MAX_ENTRIES else [pairs[0], *pairs[1 - _MAX_ENTRIES :]]
+            self.listed = len(entries) and entries[-1].number
+            content = [
+                {
+                    "number": entry.number,
+                    "values": json_values(entry.values),
+                    "label": entry.label,
+                    "changed": changed(before, entry),
+                    "current": entry is current,
+                }
+                for before, entry in pairs
+            ]
+            new = [entry.picture if entry.number not in self._pictured else None for _, entry in pairs]
             if self.view.frames.mounted:
-                self._told.update(entry.number for _, entry in pairs)
-            state = {"undo": self._history.can_undo, "redo": self._history.can_redo, "code": self._code()}
-            self.view.tell("history", {"entries": content, **state}, buffers)
+                self._pictured.update(entry.number for _, entry in pairs)
+            state = {"undo": self._history.can_undo, "redo": self._history.can_redo, "code": self.code()}
+            pictures = [b"" if each is None else each.data for each in new]
+            self.view.tell("history", {"entries": content, **state}, pictures)
 
-    def tell_verdicts(self, content: dict[str, Any]) -> None:
-        """Tell which test images pass."""
-        self._verdicts = content
+    def send_verdicts(self, content: dict[str, Any]) -> None:
+        """Send which test images pass."""
+        self.verdicts = content
         self.view.tell("cases", content)
 
     def log(self, text: str) -> None:
         """Add a line to the log drawer."""
         line = {"at": f"{datetime.now().astimezone():%H:%M:%S}", "text": text[:_LINE_CHARACTERS]}
         with self._lock:
-            self._log = [*self._log, line][-_MOST_LINES:]
+            self._log = [*self._log, line][-_MAX_LINES:]
         self.view.tell("log", {"lines": self._log})
 
     @property
@@ -247,35 +299,28 @@ class Screen:
         """What is in the log drawer."""
         return tuple(f"{line['at']} {line['text']}" for line in self._log)
 
+    def close(self, text: str) -> None:
+        """Say that values are not followed any more."""
+        self._is_closed = True
+        self.send_setup()
+        self.send_history()
+        self.note(text)
+
     def ready(self) -> None:
-        """Tell a view that has been mounted everything, its picture last."""
+        """Send everything to a view that has been mounted, its picture last."""
         self.view.frames.mount()
-        with self._telling:
-            self._told.clear()
-        self.tell_setup()
-        self.tell_history()
-        if self._verdicts is not None:
-            self.view.tell("cases", self._verdicts)
+        with self._listing:
+            self._pictured.clear()
+        self.send_setup()
+        self.send_history()
+        if self.verdicts is not None:
+            self.view.tell("cases", self.verdicts)
         if self._reference is not None:
             self.view.tell("reference", *self._reference)
         if self._log:
             self.view.tell("log", {"lines": self._log})
         self.view.frames.ready()
-        if self._noted:
-            self._tell_note()
-        if self._failure is not None:
+        if self._note["text"]:
+            self.view.tell("note", self._note)
+        if self._failure:
             self.view.tell("error", self._failure)
-
-
-def _entry(before: Entry | None, entry: Entry, *, is_current: bool) -> dict[str, Any]:
-    return {
-        "number": entry.number,
-        "values": plain_values(entry.values),
-        "label": entry.label,
-        "changed": changed(before, entry),
-        "current": is_current,
-    }
-
-
-def _thumbnail(entry: Entry) -> bytes:
-    return b"" if entry.picture is None else entry.picture.data

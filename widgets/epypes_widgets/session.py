@@ -1,7 +1,7 @@
-"""What has been asked of a runner, and what has it computed?
+"""The values that are wanted of a runner, and the last run that it has completed.
 
-Values that the hand sets wait here. They are tried on the runner, and taken over by it together with what was computed
-from them, in one step; so cells never see the one without the other. Values with which a function fails go on waiting.
+Values that are set wait here. They are tried on the runner, and taken over by it together with what was computed from
+them, in one step; so cells never see the one without the other. Values with which a function fails go on waiting.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import is_, is_not
 from typing import Any
 
-from epypes.run import Run
-from epypes_widgets.looking.films import Payload, is_alike
-from epypes_widgets.places import Tunable, place_of
+from epypes.run import CompGraphRunner, Run
+from epypes_widgets.images import Payload, is_alike
+from epypes_widgets.target import Tunable
 
 
 class Session:
@@ -32,13 +32,14 @@ class Session:
         The last run that completed; None before the first.
     image
         The index of the payload that it was computed from; None for one that is not among them.
-    place
-        Where its functions run.
+    is_service
+        Whether the functions run in a service: others may set hyperparameters too, whose changes are not to be
+        overwritten unseen, and values are written back.
     """
 
     def __init__(self, runner: Tunable, payloads: Sequence[Payload] = ()) -> None:
         self.runner, self.payloads = runner, tuple(payloads)
-        self.place = place_of(runner)
+        self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
         self.image = self._image_of(runner.last, is_alike)
         self._lock = threading.Lock()
@@ -79,22 +80,23 @@ class Session:
     def payload(self) -> tuple[Any, ...]:
         """The values of the free source tokens in the last run that completed."""
         run, free = self.result, self.runner.free_source_tokens
-        return () if run is None else tuple(run.tokens.values[run.tokens.program.slots[token]] for token in free)
+        return () if run is None else tuple(_value(run, token) for token in free)
+
+    @property
+    def notice(self) -> str:
+        """What is wrong with the place where the functions run; empty if nothing is."""
+        return "" if isinstance(self.runner, CompGraphRunner) else self.runner.notice
 
     def want(self, values: Mapping[str, Any]) -> None:
         """Ask for values of hyperparameters; they are newer than what a cell has set on the runner until now.
 
-        What somebody else has set at the same time is not overwritten: see ``changes_of_others``.
+        What others have set on a service at the same time is not overwritten: see ``changes_of_others``.
         """
         now = self.runner.hyperparameters
         with self._lock:
             self._wanted.update(values)
-            if not self.place.is_shared:
+            if not self.is_service:
                 self._seen.update({name: now[name] for name in values if name in now})
-
-    def close(self) -> None:
-        """Change the runner no more."""
-        self._is_closed = True
 
     def want_image(self, index: int) -> None:
         """Ask for another payload; IndexError if there is none of this index."""
@@ -103,13 +105,18 @@ class Session:
         with self._lock:
             self._image_wanted = index
 
+    def close(self) -> None:
+        """Change the runner no more."""
+        self._is_closed = True
+
     def changes_of_others(self) -> dict[str, Any]:
-        """Return the hyperparameters that somebody else has changed since this was last asked, with their values.
+        """Return the hyperparameters that others have changed since the last call, with their values.
 
         They count from then on: what was asked for these tokens before is dropped, and so is what was asked for a token
         that is no hyperparameter any more.
         """
-        self.place.catch_up()
+        if not isinstance(self.runner, CompGraphRunner):
+            self.runner.catch_up()
         now = dict(self.runner.hyperparameters)
         with self._lock:
             changed = {name: value for name, value in now.items() if self._seen.get(name, self) is not value}
@@ -134,7 +141,7 @@ class Session:
         Run
             It may have failed; the runner and ``result`` are then what they were.
         bool
-            Whether that is settled. If not, somebody else has changed the runner meanwhile: it is to be tried again.
+            Whether that is settled. If not, the runner was changed meanwhile: it is to be tried again.
         """
         with self._lock:
             wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
@@ -142,7 +149,8 @@ class Session:
         run = self.runner.trial(wanted, *targets, payload=payload)
         if run.failure is not None or self._is_closed:
             return run, True
-        if not (self._changes_nothing(run, wanted, payload) or self.runner.adopt(run)):
+        is_new = bool(wanted) or payload is not None or bool(run.report.ran)
+        if is_new and not self.runner.adopt(run):
             return run, False
         self._settle(run, wanted, image)
         return run, True
@@ -151,31 +159,27 @@ class Session:
         """Set what is wanted on a runner that is changed all the time; its next run has it."""
         with self._lock:
             wanted, self._wanted = self._wanted, {}
-        self.place.put(wanted)
+        if isinstance(self.runner, CompGraphRunner):
+            self.runner.set(**wanted)
+        else:
+            self.runner.put(wanted)
 
-    def tried(self, values: Mapping[str, Any], targets: Sequence[str]) -> Run:
-        """Return a run with these hyperparameters, on the present payload if it can be had; nothing is changed by it.
-
-        Raises
-        ------
-        LookupError
-            It can't be had at all.
-        """
+    def compared(self, values: Mapping[str, Any], token: str) -> Run:
+        """Return a run with these hyperparameters, on the present payload; LookupError if it can't be had."""
         known = self.runner.hyperparameters
-        return self.place.compared({name: value for name, value in values.items() if name in known}, *targets)
+        values = {name: value for name, value in values.items() if name in known}
+        if isinstance(self.runner, CompGraphRunner):
+            return self.runner.trial(values, token)
+        return self.runner.remembered(values, token)
 
     def _image_of(self, run: Run | None, is_one: Callable[[Any, Any], bool] = is_) -> int | None:
         """Return the index of the payload that a run was computed from."""
         if run is None:
             return None
-        values, slots = run.tokens.values, run.tokens.program.slots
         for index, payload in enumerate(self.payloads):
-            if all(is_one(values[slots[token]], value) for token, value in payload.values.items()):
+            if all(is_one(_value(run, token), value) for token, value in payload.values.items()):
                 return index
         return None
-
-    def _changes_nothing(self, run: Run, wanted: Mapping[str, Any], payload: object) -> bool:
-        return not wanted and payload is None and not run.report.ran
 
     def _settle(self, run: Run, wanted: Mapping[str, Any], image: int | None) -> None:
         before = self.payload
@@ -190,3 +194,7 @@ class Session:
                 self.image = self._image_of(run)
             if self._image_wanted == image:
                 self._image_wanted = None
+
+
+def _value(run: Run, token: str) -> Any:
+    return run.tokens.values[run.tokens.program.slots[token]]

@@ -1,13 +1,14 @@
-"""What does a saved notebook show of a panel where no kernel runs?
+"""The output beside a panel for a saved notebook, where no kernel runs: its last picture and values.
 
-Nothing but text, borders and one picture: no script, no style sheet, no colours of its own, so that it is readable on
-any ground, also where a page does not trust the notebook.
+The widget alone leaves nothing there: beside it stands an output of plain HTML, which the live panel hides. It has
+text, borders and one picture: no script, no style sheet, no colours of its own, so that it is readable on any ground,
+also where a page does not trust the notebook.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from epypes.display.previews.model import Look
@@ -16,13 +17,13 @@ from epypes.display.text import content, cut, escape, fitted, written_length
 from epypes.errors import NotComputed
 from epypes.graph import colour_order
 from epypes.run import Run
-from epypes_widgets.pictures import picture_of
-from epypes_widgets.values import differing, said
+from epypes_widgets.frames import still_picture
+from epypes_widgets.values import differing, short_text
 
 # In a page a picture is a third longer. Together with 40 rows of 420 characters it stays below 120 kB.
 _PICTURE_BYTES: Final = 72_000
 _PICTURE_SIDE_PX: Final = 720
-_MOST_ROWS: Final = 40
+_MAX_ROWS: Final = 40
 _NAME_CHARACTERS: Final = 40
 # What a text takes in the page at most.
 _CELL_ROOM: Final = 80
@@ -30,6 +31,36 @@ _TEXT_ROOM: Final = 800
 # Within the picture, since an output cuts off what is around it.
 _FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outline-offset:-1px"
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
+
+
+class StaticOutput:
+    """An output beside the panel, replaced from time to time.
+
+    Parameters
+    ----------
+    html
+        Returns what it shows now.
+    """
+
+    def __init__(self, html: Callable[[], str]) -> None:
+        self.html = html
+        self._handle: Any = None
+        self._shown = ""
+
+    def display(self) -> None:
+        """Show it below the outputs of the running cell."""
+        from IPython.display import HTML, display
+
+        self._shown = self.html()
+        self._handle = display(HTML(self._shown), display_id=True)
+
+    def update(self) -> None:
+        """Replace it where it is shown, if anything has changed."""
+        from IPython.display import HTML
+
+        if self._handle is not None and (new := self.html()) != self._shown:
+            self._shown = new
+            self._handle.update(HTML(new))
 
 
 def static_html(
@@ -61,8 +92,8 @@ def static_html(
     on = f" of {cut(image, _NAME_CHARACTERS)}" if image else ""
     picture = _shown(run, token, on) if token is not None else ""
     # Half a line of code is worse than none: the table has the values.
-    is_told = code and written_length(code) <= _TEXT_ROOM
-    line = f'<pre style="white-space:pre-wrap;font-family:monospace">{content(code)}</pre>' if is_told else ""
+    fits = code and written_length(code) <= _TEXT_ROOM
+    line = f'<pre style="white-space:pre-wrap;font-family:monospace">{content(code)}</pre>' if fits else ""
     return f'<figure class="epypes-static" style="margin:0">{picture}{_table(values, defaults)}{line}</figure>'
 
 
@@ -74,7 +105,7 @@ def _shown(run: Run, token: str, on: str) -> str:
         return _caption(f"{name}{on}: {cut(str(error), 200)}")
     look = Look(colour_order(run.cg, token))
     about = f"{name}{on}: {sketch(value, look).shown.detail}"
-    picture = picture_of(run, token, _PICTURE_SIDE_PX, _PICTURE_BYTES)
+    picture = still_picture(run, token, _PICTURE_SIDE_PX, _PICTURE_BYTES)
     if picture is None:
         return _caption(about)
     data = base64.b64encode(picture.data).decode()
@@ -92,27 +123,17 @@ def _table(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
     if not values:
         return ""
     moved = {name for name in differing(defaults, values) if name in defaults}
-    kept = _most_telling(values, moved)
-    rows = "".join(_row(name, values[name], defaults, name in moved) for name in values if name in kept)
-    more = _cells("td", f"and {len(values) - len(kept)} more") if len(kept) < len(values) else ""
-    head = _cells("th", "hyperparameter", "value", "since the start")
-    return f'<table style="border-collapse:collapse">{head}{rows}{more}</table>'
-
-
-def _most_telling(values: Mapping[str, Any], moved: set[str]) -> set[str]:
-    """Return the names that are listed: those that were moved before all others."""
-    first = sorted(values, key=lambda name: name not in moved)
-    return set(first[:_MOST_ROWS])
-
-
-def _row(name: str, value: Any, defaults: Mapping[str, Any], is_moved: bool) -> str:
-    label = cut(name, _NAME_CHARACTERS)
-    if not is_moved:
-        return _cells("td", label, said(value), "")
-    before, now = said(defaults[name]), said(value)
-    change = f"● changed from {before}" if before != now else "● changed"
-    return _cells("td", label, now, change)
-
-
-def _cells(tag: str, *texts: str) -> str:
-    return f"<tr>{''.join(f'<{tag}{_LEFT}>{content(fitted(text, _CELL_ROOM))}</{tag}>' for text in texts)}</tr>"
+    # Those that were moved are listed before all others.
+    listed = set(sorted(values, key=lambda name: name not in moved)[:_MAX_ROWS])
+    rows = [("th", "hyperparameter", "value", "since the start")]
+    for name in values:
+        if name in listed:
+            now, before = short_text(values[name]), short_text(defaults[name]) if name in moved else ""
+            change = f"● changed from {before}" if before != now else "● changed"
+            rows.append(("td", cut(name, _NAME_CHARACTERS), now, change if name in moved else ""))
+    if len(listed) < len(values):
+        rows.append(("td", f"and {len(values) - len(listed)} more", "", ""))
+    cells = (
+        "".join(f"<{tag}{_LEFT}>{content(fitted(text, _CELL_ROOM))}</{tag}>" for text in texts) for tag, *texts in rows
+    )
+    return f'<table style="border-collapse:collapse">{"".join(f"<tr>{row}</tr>" for row in cells)}</table>'

@@ -1,48 +1,49 @@
-"""What happens between the hand and the screen?
+"""From a value that is set to its picture on the screen, and to the history.
 
-A value that is set is wanted from then on (``session``), and the worker is asked. It tries what is wanted, shows what
-comes out, and when the hand has come to rest commits it to the history.
+A value that is set is wanted from then on (``session``), and the worker gets a request. It tries what is wanted, shows
+what comes out, and commits it to the history when the values have come to rest.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from time import perf_counter_ns
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StillRunning
-from epypes.graph import CompGraph
+from epypes.graph import subgraph
 from epypes.run import Failure, Run
-from epypes_widgets.hand import Hand
+from epypes_widgets.control_set import ControlSet
+from epypes_widgets.frames import thumbnail
 from epypes_widgets.history import Entry, History
-from epypes_widgets.pictures import thumbnail
-from epypes_widgets.places import Tunable
-from epypes_widgets.screen import Screen
+from epypes_widgets.screen import Comparison, Screen
 from epypes_widgets.session import Session
-from epypes_widgets.shown import Comparison
-from epypes_widgets.values import is_same, said
+from epypes_widgets.values import is_same, short_text
 from epypes_widgets.worker import Worker
 
 _LOG: Final = logging.getLogger(__name__)
-# Keys come at most every 30 ms when one is held down; who stops for this long has chosen.
+# Keys come at most every 30 ms when one is held down; a pause of this length is a choice.
 REST_S: Final = 0.25
-# The last value of a drag may arrive after the word that the slider was let go.
+# The last value of a drag may arrive after the message that the slider was released.
 _AFTER_RELEASE_S: Final = 0.06
 _STILL_S: Final = 0.5
 # A cell that changes the runner all the time must not keep pictures from being shown, or values from counting.
-_MOST_ATTEMPTS: Final = 3
+_MAX_ATTEMPTS: Final = 3
 _CLOSED: Final = "This panel is closed: the picture and the values are the last ones."
 
 
 class Tuning:
-    """Wires the parts of a panel.
+    """The loop of a panel.
 
     Parameters
     ----------
-    hand, session, history
-        What is moved, wanted and remembered.
+    controls, session, history, worker
+        What is moved, wanted and remembered, and the thread that computes.
+    screen
+        Shows what was computed.
     settled
         Is called on the worker's thread some time after values were committed.
 
@@ -52,19 +53,23 @@ class Tuning:
         Whether values are computed as they come; if not, ``run`` computes them.
     """
 
-    screen: Screen
-
-    def __init__(self, hand: Hand, session: Session, history: History, settled: Callable[[], None]) -> None:
-        self.hand, self.session, self.history = hand, session, history
-        self.runner: Tunable = session.runner
+    def __init__(
+        self,
+        controls: ControlSet,
+        session: Session,
+        history: History,
+        worker: Worker,
+        screen: Screen,
+        settled: Callable[[], None],
+    ) -> None:
+        self.controls, self.session, self.history, self.screen = controls, session, history, screen
+        self.runner, self.worker = session.runner, worker
         self.is_live = True
-        self.worker = Worker(self._compute, self.report)
         self._settled = settled
         self._lock = threading.Lock()
-        self._commits = False
-        self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
+        self._commits = self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
         self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
-        for control in hand.controls:
+        for control in controls.controls:
             control.on_change(self._moved)
 
     def begin(self) -> None:
@@ -77,7 +82,7 @@ class Tuning:
             self._commit()
         else:
             self._commits = True
-            self.worker.ask()
+            self._request()
 
     def close(self, timeout_s: float) -> None:
         """Follow nothing any more; StillRunning names the functions that have not returned in time."""
@@ -89,58 +94,51 @@ class Tuning:
         except StillRunning as error:
             raise StillRunning(error.name, self.runner.running, timeout_s) from None
         finally:
-            if is_first:
-                self._rest()
-
-    def _rest(self) -> None:
-        """Leave the last picture that completed, with the values that it was made with."""
-        self.hand.release()
-        run = self.session.result
-        if run is not None:
-            self._log(self.hand.follow(run.hyperparameters))
-            self.screen.show(run, 0)
-        self.screen.close(_CLOSED)
-        self._settled()
+            if is_first:  # leave the last picture that completed, with the values that it was made with
+                self.controls.release()
+                run = self.session.result
+                if run is not None:
+                    self._log(self.controls.follow(run.hyperparameters))
+                    self.screen.show(run, 0)
+                self.screen.close(_CLOSED)
+                self._settled()
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
-    def want(self, values: Mapping[str, Any], *, commit: bool = True, is_by_hand: bool = False) -> None:
+    def want(self, values: Mapping[str, Any], *, commit: bool = True, by_user: bool = False) -> None:
         """Move controls to values and have them computed; ValueError, and nothing is done, if one is out of range."""
-        values = self.hand.uncontested(values)
+        if by_user:
+            values = self.controls.moved(values)
         with self._lock:  # of two threads the one whose value stands is wanted last
-            self.session.want(self.hand.set(values, is_by_hand=is_by_hand))
-        self.screen.note("")
-        if commit:
-            self._commits = True
-        else:
-            self._commit_later(REST_S)
-        self.worker.ask()
+            self.session.want(self.controls.set(values, by_user=by_user))
+        self._wanted(commit=commit)
 
     def want_image(self, index: int) -> None:
         """Have another payload computed; IndexError if there is none."""
         self.session.want_image(index)
         self._commits = True
-        self.worker.ask()
+        self._request()
 
-    def look(self) -> None:
-        """Have what is looked at computed, live or not; if not, from the values that the runner has."""
+    def look(self, **shown: Any) -> None:
+        """Change what is shown and have it computed, live or not; if not, from the values that the runner has."""
+        self.screen.change(**shown)
         self._has_looked = True
-        self.worker.ask()
+        self._request()
 
     def release(self) -> None:
-        """Commit what the hand has let go."""
-        waited, refused = self.hand.release()
+        """Commit what the user has released."""
+        waited, refused = self.controls.release()
         self._log(refused)
         if waited:
             self.session.want(waited)
-            self.worker.ask()
+            self._request()
         if self.is_live:
             self._commit_later(_AFTER_RELEASE_S)
 
     def run(self) -> None:
         """Compute what is wanted, live or not."""
         self._is_forced = self._commits = True
-        self.worker.ask()
+        self._request()
 
     def go_to(self, find: Callable[[], Entry | None]) -> bool:
         """Go to the entry of the history that is found after the present values were committed; False if none is."""
@@ -152,52 +150,60 @@ class Tuning:
             return False
         values = {name: value for name, value in entry.values.items() if name in self.runner.hyperparameters}
         with self._lock:
-            self._log(self.hand.follow(values))
+            self._log(self.controls.follow(values))
             self.session.want(values)
-        if self.history.is_of_images(entry) and entry.image not in (None, self.session.image_wanted):
-            self.session.want_image(entry.image)
+        if entry.image not in (None, self.session.image_wanted) and entry.image in range(len(self.session.payloads)):
+            self.session.want_image(entry.image or 0)
         self._is_forced = True
-        self.worker.ask()
-        self.screen.tell_history()
+        self._request()
+        self.screen.send_history()
         return True
 
     def leave(self) -> None:
-        """Know that no view is left: a service that nobody looks at is not listened to."""
-        if self.session.place.is_shared:
+        """Take note that no view is left: a service without one is not listened to."""
+        if self.session.is_service:
             self._unwatch()
 
     def come_back(self) -> None:
-        """Know that there is a view, and show what has happened meanwhile."""
+        """Take note that there is a view, and show what has happened meanwhile."""
         if self._forget is None and not self.worker.closed:
             self._forget = self.runner.watch(self._runner_changed)
-            self.worker.ask()
+            self._request()
 
     def seen(self) -> None:
-        """Know that a frame has been painted: what came meanwhile is next."""
+        """Take note that a frame has been painted: what came meanwhile is next."""
         if self._is_behind:
-            self.worker.ask()
+            self._request()
 
     def report(self, exception: BaseException) -> None:
-        """Tell of something that failed in the panel itself, in its log and in that of the process."""
+        """Say what failed in the panel itself, in its log and in that of the process."""
         _LOG.error("The panel has failed", exc_info=exception)
         self.screen.log(f"{type(exception).__name__}: {exception}")
 
     def _moved(self, values: Mapping[str, Any]) -> None:
-        """Take values from the hand, on the thread that answers the front end."""
-        values = self.hand.uncontested(values)
-        if not values:
-            return
+        """Take values that the user has moved, on the thread that handles messages of the front end."""
         with self._lock:
-            self.hand.moved(values)
-            self.session.want({name: self.hand.control(name).read()[name] for name in values})
+            values = self.controls.moved(values)
+            if values:
+                self.session.want({name: self.controls.control(name).read()[name] for name in values})
+        if values:
+            self._wanted(commit=False)
+
+    def _wanted(self, *, commit: bool) -> None:
         self.screen.note("")
-        self._commit_later(REST_S)
-        self.worker.ask()
+        if commit:
+            self._commits = True
+        else:
+            self._commit_later(REST_S)
+        self._request()
+
+    def _request(self) -> None:
+        self.worker.post("compute", partial(self._compute, perf_counter_ns()))
 
     def _runner_changed(self) -> None:
         if not self.worker.is_current:
             self.screen.refer_anew()
-            self.worker.ask()
+            self._request()
 
     def _unwatch(self) -> None:
         forget, self._forget = self._forget, None
@@ -205,9 +211,9 @@ class Tuning:
             forget()
 
     def _commit_later(self, delay_s: float) -> None:
-        self.worker.later("commit", delay_s, self._commit, is_work=True)
+        self.worker.post("commit", self._commit, delay_s)
 
-    def _log(self, sentences: list[str]) -> None:
+    def _log(self, sentences: Iterable[str]) -> None:
         for sentence in sentences:
             self.screen.log(sentence)
 
@@ -220,12 +226,13 @@ class Tuning:
         is_asked = self._is_forced or self._has_looked or self._is_unwell
         self._is_forced = self._has_looked = False
         if not (is_wanted or is_asked):
-            self._tell_of_place()
+            self._show_notice()
             return
         is_moved = is_asked or self.session.is_wanting
         if self.screen.view.frames.left and not is_moved:
-            return  # the cell was run again, and another panel looks at this runner now
-        is_moved = is_moved or is_changed or self._has_run
+            return  # the cell was run again, and another panel shows this runner now
+        # Also if the runner was run since its run was shown.
+        is_moved = is_moved or is_changed or self.runner.last is not self.session.result
         if is_moved or not self._waits_for_screen():
             self._show_run(is_wanted, changed_ns if is_moved else 0)
 
@@ -243,7 +250,7 @@ class Tuning:
             return
         self.screen.follow(run)
         self.screen.show(run, changed_ns)
-        self._tell_of_place()
+        self._show_notice()
         if not is_settled:
             self.session.insist()
             self._commit_later(REST_S)
@@ -252,20 +259,23 @@ class Tuning:
             self._commit(is_final=True)
         self._compare()
 
+    def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
+        for _ in range(_MAX_ATTEMPTS):
+            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets, is_wanted=is_wanted)
+            if is_settled:
+                break
+            self._follow_others()
+        return run, is_settled
+
     def _refuse(self, error: Exception) -> None:
         """Say why there is no run."""
-        if not (isinstance(error, NotComputed) and self.session.place.is_shared):
-            self._is_unwell = bool(self.session.place.notice())
+        if isinstance(error, NotComputed) and self.session.is_service:
+            if self.session.result is not None:
+                self.screen.show(self.session.result, 0)
+            self.screen.note(str(error), waits=True)
+        else:
+            self._is_unwell = bool(self.session.notice)
             self.screen.fail(str(error), names=tuple(getattr(error, "problems", ())))
-            return
-        if self.session.result is not None:
-            self.screen.show(self.session.result, 0)
-        self.screen.wait(str(error))
-
-    @property
-    def _has_run(self) -> bool:
-        """Whether somebody has run the runner since its run was shown."""
-        return self.runner.last is not self.session.result
 
     def _waits_for_screen(self) -> bool:
         """Whether a newer run is to be fetched only when the picture on its way has been painted."""
@@ -274,44 +284,34 @@ class Tuning:
         self._is_behind = self.screen.view.frames.in_flight is not None
         return self._is_behind
 
-    def _tell_of_place(self) -> None:
+    def _show_notice(self) -> None:
         """Say what is wrong with the place where the functions run: the picture may not be the newest."""
-        notice = self.session.place.notice()
+        notice = self.session.notice
         self._is_unwell = bool(notice)
         if notice and notice != self.screen.error:
             self.screen.fail(notice)
-
-    def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
-        for _ in range(_MOST_ATTEMPTS):
-            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets, is_wanted=is_wanted)
-            if is_settled:
-                break
-            self._follow_others()
-        return run, is_settled
 
     def _follow_others(self) -> bool:
         """Move the controls to what others have set; return whether they have set anything."""
         wanted = self.session.wanted
         changed = self.session.changes_of_others()
         if changed:
-            self._tell_conflict(wanted, changed)
-            self._log(self.hand.follow(changed))
+            if self.session.is_service:
+                self._show_conflict(wanted, changed)
+            self._log(self.controls.follow(changed))
             self._commit_later(REST_S)
         return bool(changed)
 
-    def _tell_conflict(self, wanted: Mapping[str, Any], changed: Mapping[str, Any]) -> None:
-        """Say which values of the hand are not set, since somebody else has set them at the same time."""
-        if not self.session.place.is_shared:
-            return
-        held = self.hand.contest(changed)
-        lost = [
-            name for name in changed if name in held or (name in wanted and not is_same(wanted[name], changed[name]))
-        ]
-        for name in lost:
-            mine = f"{said(wanted[name])} was not set" if name in wanted else "it stays so"
-            sentence = f"Somebody else has set {name} to {said(changed[name])}; {mine}. Move it again to change it."
-            self.screen.log(sentence)
-            self.screen.note(sentence)
+    def _show_conflict(self, wanted: Mapping[str, Any], changed: Mapping[str, Any]) -> None:
+        """Say which values of the user are not set, since another client has set them at the same time."""
+        held = self.controls.contest(changed)
+        for name, value in changed.items():
+            if name in held or (name in wanted and not is_same(wanted[name], value)):
+                mine = f"{short_text(wanted[name])} was not set" if name in wanted else "it stays so"
+                way_out = "Move it again to change it."
+                sentence = f"Another client has set {name} to {short_text(value)}; {mine}. {way_out}"
+                self.screen.log(sentence)
+                self.screen.note(sentence)
 
     def _fail(self, run: Run, failure: Failure) -> None:
         good = self.session.result
@@ -321,44 +321,45 @@ class Tuning:
 
     def _at_fault(self, run: Run, function: str) -> list[str]:
         """Return what was set and goes into a function, or into what it is given; if nothing was, all that it takes."""
-        if function not in self.runner.cg.functions:
+        cg, wanted = self.runner.cg, self.session.wanted
+        if function not in cg.functions:
             return []  # f_in or f_out of a service
-        wanted, takes = self.session.wanted, self.runner.cg.func_inputs(function)
-        given = [name for name in takes if name in wanted]
-        behind = (name for name in _behind(self.runner.cg, function) if name in wanted)
-        return given or list(behind) or [name for name in takes if name in run.hyperparameters]
+        takes = cg.func_inputs(function)
+        behind = subgraph(cg, takes).tokens
+        given = [name for name in takes if name in wanted] or [name for name in wanted if name in behind]
+        return given or [name for name in takes if name in run.hyperparameters]
 
     def _commit(self, *, is_final: bool = False) -> None:
-        """Add the values that the runner has taken over to the history, unless they are there or under a hand."""
+        """Add the values that the runner has taken over to the history, unless they are there or held."""
         run = self.session.result
-        if run is None or self.session.wanted or (self.hand.is_holding and not is_final):
+        if run is None or self.session.wanted or (self.controls.is_holding and not is_final):
             return
         self._add(run)
         entries = self.history.entries
-        if entries and entries[-1].number != self.screen.told:  # another panel may have added some
-            self.screen.tell_history()
-        self.worker.later("still", _STILL_S, self._settled)
+        if entries and entries[-1].number != self.screen.listed:  # another panel may have added some
+            self.screen.send_history()
+        self.worker.post("still", self._settled, _STILL_S, is_work=False)
 
     def _add(self, run: Run) -> None:
         current, image = self.history.current, self.session.image
         if not self.session.payloads and current is not None:
             image = current.image  # that of another panel on this runner
-        token, compute_ms = self.screen.token_in(run), self.screen.compute_ms
-        seen = thumbnail(run, token)
-        self.history.commit(run.hyperparameters, token=token, picture=seen, compute_ms=compute_ms, image=image)
+        token = self.screen.shown.token
+        about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms}
+        self.history.commit(run.hyperparameters, image=image, token=token, **about)
 
     def _compare(self) -> None:
         """Show what the picture is compared with, if that is not part of its own run."""
         comparison, token = self.screen.shown.comparison, self.screen.shown.token
         if comparison is None or token is None or comparison.kind == "stage":
-            self.screen.refer_to_nothing()
+            self.screen.refer_anew(to_nothing=True)
             return
         payload = self.session.payload
         if self.screen.refers_to((comparison, token), payload):
             return
         try:
             values, label = self._compared(comparison)
-            run = self.session.tried(values, (token,))
+            run = self.session.compared(values, token)
         except LookupError as error:
             self.screen.log(str(error))
             self.screen.note(str(error))
@@ -372,22 +373,7 @@ class Tuning:
     def _compared(self, comparison: Comparison) -> tuple[Mapping[str, Any], str]:
         if comparison.kind == "default":
             return self.runner.first_hyperparameters, "default"
-        if comparison.kind != "history":
-            raise LookupError(f"Nothing is called {comparison.kind!r:.40} that a picture could be compared with.")
         entry = next((entry for entry in self.history.entries if entry.number == comparison.number), None)
         if entry is None:
             raise LookupError(f"No entry {comparison.number} in the history.")
         return entry.values, f"history {entry.number}"
-
-
-def _behind(cg: CompGraph, function: str) -> Iterator[str]:
-    """Yield the tokens that a function takes, then those that they are made from."""
-    seen = dict.fromkeys(cg.func_inputs(function))
-    waiting = deque(seen)
-    while waiting:
-        token = waiting.popleft()
-        yield token
-        maker = cg.digraph.producer.get(token)
-        found = [] if maker is None else [name for name in cg.func_inputs(maker) if name not in seen]
-        seen.update(dict.fromkeys(found))
-        waiting.extend(found)

@@ -1,7 +1,7 @@
 // Are histograms and marks drawn where their values are?
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { fullest, heightOf, outline, shareOf, valueAt } from "../../../widgets/epypes_widgets/view/bins.js";
+import { fullest, heightOf, outline, shareOf, valueAt } from "../../../widgets/epypes_widgets/view/histogram.js";
 import { targetLabel } from "../../../widgets/epypes_widgets/view/compare.js";
 import { linePath, overlayCount, pointPath } from "../../../widgets/epypes_widgets/view/overlay.js";
 

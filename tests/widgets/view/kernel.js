@@ -224,7 +224,7 @@ const answers = {
     kernel.deliver({
       kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images,
       live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
-      code: "runner.rerun()", promote_to: "services/edges", settings: ["good", "dark"], history: [], undo: false, redo: false, token: kernel.token, pinned: [],
+      promote_to: "services/edges", settings: ["good", "dark"], token: kernel.token, pinned: [], closed: false,
     }, [await bytesOf("image", 96), await bytesOf("gray", 96)]);
     await kernel.remember();
     await kernel.run();
@@ -266,8 +266,8 @@ const answers = {
   probe({ id, x, y }) {
     kernel.deliver({ kind: "probe", id, x, y, rows: STAGES.slice(0, 4).map((token) => ({ token, text: token === "image" ? "B 12 G 40 R 200" : String((x + y) % 256), state: "fresh" })) });
   },
-  save({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark", name], said: `saved ${name}.toml`, ok: true }); },
-  load({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark"], said: `There are no settings ${name}.`, ok: false }); },
+  save({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark", name], text: `saved ${name}.toml`, ok: true }); },
+  load({ name }) { kernel.deliver({ kind: "settings", names: ["good", "dark"], text: `There are no settings ${name}.`, ok: false }); },
   promote({ to }) {
     kernel.deliver({ kind: "promoted", state: "running", text: "", to });
     setTimeout(() => kernel.deliver({ kind: "promoted", state: "done", text: `3 functions written to ${to}; replayed, same values`, to }), 30);

@@ -1,46 +1,12 @@
 // Is the final picture always the final value's, whatever becomes of the messages?
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { modelValue } from "../../../widgets/epypes_widgets/view/slides.js";
-import { outbox } from "../../../widgets/epypes_widgets/view/outbox.js";
-import { arrivals, newestOnly, oneAtATime } from "../../../widgets/epypes_widgets/view/protocol.js";
-import { withBytes } from "../../../widgets/epypes_widgets/view/screen.js";
+import { failures, withBytes } from "../../../widgets/epypes_widgets/view/frames.js";
+import { newestNext, newestOnly, outbox, questions } from "../../../widgets/epypes_widgets/view/protocol.js";
 
-test("a newer frame is shown, an older one acknowledged only", () => {
-  const order = arrivals();
-  assert.equal(order.frame(2), "show");
-  assert.equal(order.frame(1), "acknowledge");
-  assert.equal(order.frame(3), "show");
-  assert.ok(order.isOvertaken(2));
-});
-test("a frame that comes again while it is decoded waits, and is acknowledged afterwards", () => {
-  const order = arrivals();
-  order.frame(1);
-  assert.equal(order.frame(1), "wait");
-  order.paint({ seq: 1 });
-  assert.equal(order.frame(1), "acknowledge");
-});
-test("a frame that could not be shown may come again", () => {
-  const order = arrivals();
-  order.frame(1);
-  order.lose(1);
-  assert.equal(order.frame(1), "show");
-});
-test("in any order the newest is painted last", () => {
-  for (const seqs of permutations([1, 2, 3, 4, 4])) {
-    const order = arrivals();
-    let shown = 0;
-    for (const seq of seqs) {
-      if (order.frame(seq) !== "show") continue;
-      shown = seq;
-      order.paint({ seq });
-    }
-    assert.equal(shown, 4);
-  }
-});
 test("an error stays until a better frame comes", () => {
-  const order = arrivals();
-  assert.ok(order.fail({ seq: 5, text: "no" }));
+  const order = failures();
+  order.fail({ seq: 5, text: "no" });
   order.paint({ seq: 6, stale: true });
   assert.equal(order.failure.text, "no");
   order.paint({ seq: 4 });
@@ -48,35 +14,55 @@ test("an error stays until a better frame comes", () => {
   order.paint({ seq: 7 });
   assert.equal(order.failure, null);
 });
-test("an error that comes after a better frame is not told", () => {
-  const order = arrivals();
+test("an error that comes after a better frame does not count", () => {
+  const order = failures();
   order.paint({ seq: 7 });
-  assert.ok(!order.fail({ seq: 6, text: "late" }));
-  assert.ok(order.fail({ seq: 8, text: "new" }));
-  assert.ok(!order.fail({ seq: 7.5, text: "older" }));
+  order.fail({ seq: 6, text: "late" });
+  assert.equal(order.failure, null);
+  order.fail({ seq: 8, text: "new" });
+  order.fail({ seq: 7.5, text: "older" });
   assert.equal(order.failure.text, "new");
+});
+test("one thing is worked on at a time, the newest next", async () => {
+  const done = [];
+  let finish = () => undefined;
+  const next = newestNext((item) => {
+    done.push(item);
+    return new Promise((resolve) => (finish = resolve));
+  });
+  for (const item of ["a", "b", "c"]) next(item);
+  assert.deepEqual(done, ["a"]);
+  finish();
+  await new Promise(setImmediate);
+  assert.deepEqual(done, ["a", "c"]);
+  finish();
+  await new Promise(setImmediate);
+  next("d");
+  assert.deepEqual(done, ["a", "c", "d"]);
 });
 test("of messages that replace one another the newest passes", () => {
   const isNewest = newestOnly();
   assert.deepEqual([1, 3, 2, 3, 4].map(isNewest), [true, true, false, true, true]);
 });
 
-test("one question is asked at a time, the latest next", () => {
+test("one question is asked at a time, the latest next", async () => {
   const asked = [];
-  const questions = oneAtATime((question) => asked.push(question), 1000, () => 0);
-  for (const question of ["a", "b", "c"]) questions.ask(question);
+  const open = questions((question) => asked.push(question));
+  for (const question of ["a", "b", "c"]) open.ask(question);
   assert.deepEqual(asked, ["a"]);
-  assert.ok(questions.answer(1));
+  assert.ok(open.answer(1));
+  await new Promise(setImmediate);
   assert.deepEqual(asked, ["a", "c"]);
-  assert.ok(!questions.answer(1));
+  assert.ok(!open.answer(1));
 });
-test("a lost answer is not waited for", () => {
-  let now_ms = 0;
+test("a lost answer is not waited for", async (context) => {
+  context.mock.timers.enable({ apis: ["setTimeout"] });
   const asked = [];
-  const questions = oneAtATime((question) => asked.push(question), 1000, () => now_ms);
-  questions.ask("a");
-  now_ms = 1001;
-  questions.ask("b");
+  const open = questions((question) => asked.push(question));
+  open.ask("a");
+  open.ask("b");
+  context.mock.timers.tick(1001);
+  await new Promise(setImmediate);
   assert.deepEqual(asked, ["a", "b"]);
 });
 
@@ -136,12 +122,6 @@ test("what was moved by keys is committed once", () => {
   out.commit();
   assert.deepEqual(sent.map(({ kind }) => kind), ["move", "set"]);
 });
-test("a slider's place is a value of its model", () => {
-  const row = { names: ["x"], integer: true };
-  assert.equal(modelValue(row, [2.0000001]), 2);
-  assert.equal(modelValue({ names: ["x"], log: true }, [-1]), 0.1);
-  assert.deepEqual(modelValue({ names: ["lo", "hi"] }, [0.5, 1.5]), [0.5, 1.5]);
-});
 test("an older frame does not take back what the hand did", () => {
   const { out, later } = recorded();
   out.set({ x: 5 }, true);
@@ -163,8 +143,3 @@ test("bytes belong to the pictures in order, and texts have none", () => {
   const pictures = ["image/jpeg", "text/plain", "image/png"].map((media_type) => ({ media_type }));
   assert.deepEqual(withBytes(pictures, ["a", "b"]).map(({ bytes }) => bytes), ["a", undefined, "b"]);
 });
-
-function permutations(items) {
-  if (items.length < 2) return [items];
-  return items.flatMap((item, at) => permutations([...items.slice(0, at), ...items.slice(at + 1)]).map((rest) => [item, ...rest]));
-}

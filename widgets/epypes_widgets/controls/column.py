@@ -1,4 +1,4 @@
-"""How do the controls stand below each other, and what does the page have to know of each?"""
+"""The controls below each other, in one folder per function, and what the page has to know of each."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes_widgets.controls.control import Control
-from epypes_widgets.controls.look import sendable
-from epypes_widgets.movable import is_number
-from epypes_widgets.plain import plain
-from epypes_widgets.tips import tip
+from epypes_widgets.tooltips import tooltip
+from epypes_widgets.values import is_number, json_value, sendable
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +40,15 @@ def column(cg: CompGraph, controls: Iterable[Control]) -> Column:
     """Return controls in a column, each under the name of the function that takes its first token first."""
     # One layout and one style for all: each would be a model of its own in the browser.
     layout, heading_style = ipywidgets.Layout(), HTMLStyle()
-    boxes: list[Any] = [_filter(layout)]
+    text = "Show only hyperparameters with these letters in their name, function or tooltip"
+    search = {"placeholder": "Filter", "tooltip": text, "continuous_update": False, "style": TextStyle()}
+    boxes: list[Any] = [ipywidgets.Text(**search, layout=layout, _dom_classes=("epypes-filter",))]
     rows: list[dict[str, Any]] = []
     folders: list[dict[str, Any]] = []
     for function, own in _by_function(cg, controls):
-        inside = [_heading(function, layout, heading_style)]
+        value = f'<span class="epypes-name">{html.escape(sendable(function))}</span> <span class="epypes-time"></span>'
+        heading = ipywidgets.HTML(value, layout=layout, style=heading_style, _dom_classes=("epypes-heading",))
+        inside: list[Any] = [heading]
         for control in own:
             css = f"epypes-row-{len(rows)}"
             inside.append(ipywidgets.Box([control.widget], layout=layout, _dom_classes=("epypes-row", css)))
@@ -66,28 +68,10 @@ def _by_function(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[s
             yield function, own
 
 
-def _filter(layout: Any) -> Any:
-    tip = "Show only hyperparameters with these letters in their name, function or tip"
-    return ipywidgets.Text(
-        placeholder="Filter",
-        tooltip=tip,
-        continuous_update=False,
-        layout=layout,
-        style=TextStyle(),
-        _dom_classes=("epypes-filter",),
-    )
-
-
-def _heading(function: str, layout: Any, style: Any) -> Any:
-    name = html.escape(sendable(function))
-    value = f'<span class="epypes-name">{name}</span> <span class="epypes-time"></span>'
-    return ipywidgets.HTML(value, layout=layout, style=style, _dom_classes=("epypes-heading",))
-
-
 def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, Any]:
     ranges = [param if isinstance(param, Param) else Param() for param in control.params]
     values = control.read()
-    is_plain = control.kind != "shown"
+    is_movable = control.kind != "shown"
     return {
         "css": css,
         "names": list(control.names),
@@ -100,12 +84,12 @@ def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, 
         "low": [_end(param.low) for param in ranges],
         "high": [_end(param.high) for param in ranges],
         "step": list(control.steps) or [None] * len(ranges),
-        "default": [plain(value) if is_plain else None for value in control.first],
-        "value": [plain(values[name]) if is_plain else None for name in control.names],
+        "default": [json_value(value) if is_movable else None for value in control.first],
+        "value": [json_value(values[name]) if is_movable else None for name in control.names],
         "unit": ranges[0].unit,
-        "tip": "\n".join(tip(cg, name, param) for name, param in zip(control.names, control.params, strict=True)),
+        "tip": "\n".join(tooltip(cg, name, param) for name, param in zip(control.names, control.params, strict=True)),
     }
 
 
 def _end(end: Any) -> Any:
-    return plain(end) if is_number(end) else None
+    return json_value(end) if is_number(end) else None

@@ -1,134 +1,456 @@
-"""What can every control do, whatever it looks like?"""
+"""Controls: one or two hyperparameters and the ipywidgets widget that moves or shows them.
+
+A control keeps a value to the last bit, and in its type: the widget shows the nearest that it can. Moved numbers and
+texts of NumPy keep their type, since code that runs on ``uint8`` would do something else on ``int``.
+"""
 
 from __future__ import annotations
 
+import enum
+import html
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import replace
+from typing import Any, Final
 
 import ipywidgets
+from ipywidgets.widgets.widget_bool import CheckboxStyle
+from ipywidgets.widgets.widget_int import SliderStyle
 
+from epypes.display.previews.short import short_repr
 from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text
-from epypes_widgets.controls.kinds import is_same
+from epypes_widgets.controls.scale import Scale, exponent, refused, same_type
+from epypes_widgets.ranges import Range, allows
+from epypes_widgets.values import is_same, numpy_type, sendable
 
-Told = Callable[[Mapping[str, Any]], None]
-
-
-class Mechanism(Protocol):
-    """How values and a widget belong together; a Control calls it from one thread at a time."""
-
-    def read(self) -> dict[str, Any]:
-        """Return the values that the widget is at, by token."""
-        ...
-
-    def checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return values as the hyperparameters take them; ValueError if they don't."""
-        ...
-
-    def place(self, values: Mapping[str, Any]) -> None:
-        """Move the widget to checked values."""
-        ...
+# A longer text is a document, not a parameter: it would travel with every message about its box.
+_MAX_TEXT: Final = 2_000
+_DESCRIPTION_WIDTH: Final = "112px"
 
 
-class _Hand:
-    """What is known of the hand: who hears of it, and which values were told or written last."""
+class _Quiet(ipywidgets.Widget):
+    """A slider that does not send its value back to the front end.
+
+    ipywidgets does, for other views of the same kernel. That message would arrive right before the picture.
+    """
+
+    def trait_metadata(self, traitname: str, key: str, default: Any = None) -> Any:
+        return False if key == "echo_update" else super().trait_metadata(traitname, key, default)
+
+
+class _IntSlider(_Quiet, ipywidgets.IntSlider): ...
+
+
+class _FloatSlider(_Quiet, ipywidgets.FloatSlider): ...
+
+
+class _LogSlider(_Quiet, ipywidgets.FloatLogSlider): ...
+
+
+class _IntRange(_Quiet, ipywidgets.IntRangeSlider): ...
+
+
+class _FloatRange(_Quiet, ipywidgets.FloatRangeSlider): ...
+
+
+class Appearance:
+    """The layout and the styles of the controls of a panel: one of each, since each is a model in the browser."""
 
     def __init__(self) -> None:
-        # Held for moments only, and never while others are told, who may hold locks of their own.
-        self.lock = threading.RLock()
-        self.is_writing = False
-        self.told: dict[str, Any] = {}
-        self.listeners: list[Told] = []
+        self._layout = ipywidgets.Layout(width="100%")
+        self._styles: dict[type, Any] = {}
+
+    def of(self, names: tuple[str, ...], tooltip: str, style: type) -> dict[str, Any]:
+        """Return what the constructor of a widget is given: name, tooltip, layout and style."""
+        if style not in self._styles:
+            self._styles[style] = style(description_width=_DESCRIPTION_WIDTH)
+        text = {"description": " .. ".join(names), "tooltip": tooltip}
+        return {**text, "layout": self._layout, "style": self._styles[style]}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Control:
     """One or two hyperparameters on screen; its methods may be called from any thread.
+
+    A subclass connects its values with its widget: by ``_read``, ``_checked`` and ``_place`` for values by
+    token, or ``_get``, ``_check`` and ``_put`` for the value of its one token.
 
     Attributes
     ----------
     names
         The tokens: one, or two for a range pair, the lower one first.
-    kind
-        ``"slider"``, ``"range"``, ``"log"``, ``"choice"``, ``"check"``, ``"text"``, ``"roi"``, or ``"shown"`` for what
-        can't be moved on screen.
     params
         The values that each may take; None for anything.
     widget
         What is seen.
-    mechanism
-        How the values and the widget belong together.
-    trait
-        The trait of the widget that changes when it is moved.
     first
         The values that the hyperparameters had when they were made.
+    kind
+        ``"slider"``, ``"range"``, ``"log"``, ``"choice"``, ``"check"``, ``"text"``, ``"roi"``, or ``"shown"`` for what
+        can't be moved on screen.
     integer
         Whether all values are whole numbers.
     steps
         The distances between two values; None where there is none. On a logarithmic slider of exponents of ten.
     """
 
-    names: tuple[str, ...]
-    kind: str
-    params: tuple[Param | Roi | Text | None, ...]
-    widget: ipywidgets.Widget
-    mechanism: Mechanism = field(repr=False)
-    trait: str = "value"
-    first: tuple[Any, ...] = field(default=(), repr=False)
-    integer: bool = False
+    integer = False
     steps: tuple[float | None, ...] = ()
-    _hand: _Hand = field(default_factory=_Hand, init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        self._hand.told = self.mechanism.read()
-        self.widget.observe(self._moved, names=self.trait)
+    def __init__(
+        self, names: tuple[str, ...], params: tuple[Range, ...], widget: Any, first: tuple[Any, ...], kind: str
+    ) -> None:
+        self.names, self.params, self.widget, self.first, self.kind = names, params, widget, first, kind
+        # Held for moments only, and never while listeners are called, which may hold locks of their own.
+        self._lock = threading.RLock()
+        self._is_writing = False
+        self._listeners: list[Callable[[Mapping[str, Any]], None]] = []
+        self._reported = self._read()
+        widget.observe(self._moved, names="index" if kind == "choice" else "value")
 
     def read(self) -> dict[str, Any]:
         """Return the values by token, to the last bit."""
-        with self._hand.lock:
-            return self.mechanism.read()
+        with self._lock:
+            return self._read()
 
-    def write(self, values: Mapping[str, Any]) -> None:
-        """Move to values of some or all of the tokens; who listens to the hand does not hear of it.
+    def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return values of some or all of the tokens as the hyperparameters take them.
 
         Raises
         ------
         UnknownName
             A token is not of this control.
         ValueError
-            A token can't have its value. Nothing is moved then.
+            A token can't have its value.
         """
         for name in values:
             if name not in self.names:
                 raise UnknownName("hyperparameter", name, self.names, "of this control")
-        hand = self._hand
-        with hand.lock:
-            checked = self.mechanism.checked(values)
-            # A move of the hand on another thread waits for the lock, and then differs from what was written.
-            hand.told = {**hand.told, **checked}
-            hand.is_writing = True
-            try:
-                self.mechanism.place(checked)
-            finally:
-                hand.is_writing = False
+        with self._lock:
+            return self._checked(values)
 
-    def on_change(self, callback: Told) -> None:
-        """Call ``callback(values)`` with the tokens that the hand has moved, on the thread that answers the front end.
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Move to values of some or all of the tokens, without a call of the listeners; errors as ``check``."""
+        with self._lock:
+            checked = self.check(values)
+            # A move by the user on another thread waits for the lock, and then differs from what was written.
+            self._reported = {**self._reported, **checked}
+            self._is_writing = True
+            try:
+                self._place(checked)
+            finally:
+                self._is_writing = False
+
+    def on_change(self, callback: Callable[[Mapping[str, Any]], None]) -> None:
+        """Call ``callback(values)`` with the tokens that the user has moved, on the thread that handles its messages.
 
         A widget that was only shown, and has snapped to its steps, was not moved.
         """
-        self._hand.listeners.append(callback)
+        self._listeners.append(callback)
 
     def _moved(self, _change: object) -> None:
-        hand = self._hand
-        with hand.lock:
-            if hand.is_writing:
+        with self._lock:
+            if self._is_writing:
                 return
-            values = self.mechanism.read()
-            moved = {name: value for name, value in values.items() if not is_same(hand.told[name], value)}
-            hand.told = values
+            values = self._read()
+            moved = {name: value for name, value in values.items() if not is_same(self._reported[name], value)}
+            self._reported = values
         if moved:
-            for callback in hand.listeners:
+            for callback in self._listeners:
                 callback(moved)
+
+    def _read(self) -> dict[str, Any]:
+        return {self.names[0]: self._get()}
+
+    def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: self._check(value) for name, value in values.items()}
+
+    def _place(self, values: Mapping[str, Any]) -> None:
+        for value in values.values():
+            self._put(value)
+
+    def _get(self) -> Any:
+        raise NotImplementedError
+
+    def _check(self, value: Any) -> Any:
+        raise NotImplementedError
+
+    def _put(self, value: Any) -> None:
+        raise NotImplementedError
+
+
+# -- sliders --------------------------------------------------------------------------------------------------------
+
+
+class _Snap:
+    """A position of a slider, and the value that was put there, which counts to the last bit.
+
+    The front end snaps a slider to its steps as soon as it is shown and reports that like a move. So the first position
+    within half a step of the given value means that value; any other is the user's.
+    """
+
+    def __init__(self, scale: Scale, step: float) -> None:
+        self._scale, self._step = scale, step
+        self._exact: Any = None
+        self._placed: float | None = None
+        self._snapped: float | None = None
+
+    def put(self, value: Any, place: float) -> None:
+        """Take a value, and the position at which the slider stands for it."""
+        self._exact, self._placed, self._snapped = value, place, None
+
+    def read(self, place: float) -> Any:
+        """Return the value that is meant by a position."""
+        if place == self._placed:
+            return self._exact
+        distance = abs(self._scale.along(place) - self._scale.along(self._exact))
+        if self._snapped is None and distance <= self._step / 2 * (1 + 1e-9):
+            self._snapped = place
+        return self._exact if place == self._snapped else self._scale.meant(place)
+
+
+class SliderControl(Control):
+    """A slider of whole numbers, of floats, or of exponents."""
+
+    def __init__(self, scale: Scale, value: Any, first: Any, appearance: Mapping[str, Any]) -> None:
+        common = {"step": scale.step, "readout": False, "continuous_update": False, **appearance}
+        widget: Any
+        if scale.param.log:
+            low, high = exponent(min(scale.low, value)), exponent(max(scale.high, value))
+            widget = _LogSlider(value=float(value), base=10, min=low, max=high, **common)
+        else:
+            slider = _IntSlider if scale.integer else _FloatSlider
+            widget = slider(value=scale.place(value), min=scale.low, max=scale.high, **common)
+        self._slider, self._scale, self._snap = widget, scale, _Snap(scale, scale.step)
+        self._snap.put(value, widget.value)
+        self.integer, self.steps = scale.integer, (scale.step,)
+        super().__init__((scale.name,), (scale.param,), widget, (first,), "log" if scale.param.log else "slider")
+
+    def _get(self) -> Any:
+        return self._snap.read(self._slider.value)
+
+    def _check(self, value: Any) -> Any:
+        return self._scale.checked(value)
+
+    def _put(self, value: Any) -> None:
+        slider = self._slider
+        # Only the soft range is offered at first; code may go to the ends of the hard one.
+        slider.min, slider.max = self._scale.grown(slider.min, slider.max, value)
+        place: float = self._scale.place(value)
+        # A slider of exponents clamps to what its ends come to.
+        stands = min(max(place, 10.0**slider.min), 10.0**slider.max) if self._scale.param.log else place
+        # First: a user that moves the slider at this very moment, on another thread, means a position of its own.
+        self._snap.put(value, stands)
+        slider.value = place
+
+
+_Two = tuple[Any, Any]
+
+
+class RangeControl(Control):
+    """A slider with two handles for two hyperparameters; the lower value never exceeds the upper one."""
+
+    def __init__(self, scales: tuple[Scale, Scale], values: _Two, first: _Two, appearance: Mapping[str, Any]) -> None:
+        low, high = scales
+        self.integer, self.steps = low.integer and high.integer, (low.step, high.step)
+        slider = _IntRange if self.integer else _FloatRange
+        places = low.place(values[0]), high.place(values[1])
+        ends = {"min": min(low.low, high.low), "max": max(low.high, high.high), "step": min(low.step, high.step)}
+        widget = slider(value=places, **ends, readout=False, continuous_update=False, **appearance)
+        self._slider, self._scales = widget, scales
+        self._places: tuple[float, float] = widget.value
+        self._snaps = _Snap(low, widget.step), _Snap(high, widget.step)
+        self._settle(values, widget.value)
+        super().__init__((low.name, high.name), (low.param, high.param), widget, first, "range")
+
+    def _read(self) -> dict[str, Any]:
+        places = self._slider.value
+        if places != self._places:
+            low, high = (snap.read(place) for snap, place in zip(self._snaps, places, strict=True))
+            self._places, self._values = places, self._ordered((low, high))
+        return {scale.name: value for scale, value in zip(self._scales, self._values, strict=True)}
+
+    def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        found = {scale.name: scale.checked(values[scale.name]) for scale in self._scales if scale.name in values}
+        low, high = {**self._read(), **found}.values()
+        if low > high:
+            below, above = self.names
+            name, value, never, other, bound = (
+                (below, low, "above", above, high) if below in found else (above, high, "below", below, low)
+            )
+            text = (
+                f"{name!r} can't be {short_repr(value)}: it is never {never} {other!r}, which is {short_repr(bound)}."
+            )
+            raise ValueError(f"{text} Set {other!r} first, or both at once.")
+        return found
+
+    def _place(self, values: Mapping[str, Any]) -> None:
+        low, high = {**self._read(), **values}.values()
+        slider = self._slider
+        for scale, value in zip(self._scales, (low, high), strict=True):
+            slider.min, slider.max = scale.grown(slider.min, slider.max, value)
+        places = self._scales[0].place(low), self._scales[1].place(high)
+        # First: a user that moves the slider at this very moment, on another thread, means positions of its own.
+        self._settle((low, high), places)
+        slider.value = places
+
+    def _settle(self, values: _Two, places: tuple[float, float]) -> None:
+        self._values, self._places = values, places
+        for snap, value, place in zip(self._snaps, values, places, strict=True):
+            snap.put(value, place)
+
+    def _ordered(self, new: _Two) -> _Two:
+        """Return values in order: what was moved gives way to what was not.
+
+        The handles are always in order. Their values need not be: each has a range, a type and exact values of its own.
+        """
+        (low, high), (low_before, high_before) = new, self._values
+        if low <= high:
+            return new
+        if is_same(high, high_before):
+            low = self._scales[0].meant(high)
+            return (low, high) if low <= high else (low_before, high)
+        high = self._scales[1].meant(low)
+        if low <= high:
+            return low, high
+        return (low, high_before) if low <= high_before else self._values
+
+
+# -- choices, texts and what is only shown --------------------------------------------------------------------------
+
+
+class ChoiceControl(Control):
+    """A checkbox for False and True, else a drop-down.
+
+    The value is known by its index, since ipywidgets takes a choice of None for "nothing chosen", and 1 for True.
+    """
+
+    def __init__(self, name: str, value: Any, param: Param, first: Any, appearance: Appearance, tooltip: str) -> None:
+        choices = param.choices or ()
+        is_check = all(map(_is_truth, choices)) and sorted(choices) == [False, True]
+        if is_check:
+            self._param = replace(param, choices=(False, True))
+            style = appearance.of((name,), tooltip, CheckboxStyle)
+            self._box: Any = ipywidgets.Checkbox(value=bool(value), **style)
+        else:
+            self._param = param
+            labels = [sendable(text) for text in param.labels or map(_label, choices)]
+            # The style of sliders has all that a drop-down's has, so it can be shared.
+            style = appearance.of((name,), tooltip, SliderStyle)
+            self._box = ipywidgets.Dropdown(options=labels, index=choice_index(choices, value), **style)
+        self._trait = "value" if is_check else "index"
+        self._choices, self._numpy_type = self._param.choices or (), numpy_type(value)
+        self._exact, self._index = value, getattr(self._box, self._trait)
+        super().__init__((name,), (param,), self._box, (first,), "check" if is_check else "choice")
+
+    def _get(self) -> Any:
+        index = getattr(self._box, self._trait)
+        if index is not None and index != self._index:
+            self._index, self._exact = index, self._typed(self._choices[index])
+        return self._exact
+
+    def _check(self, value: Any) -> Any:
+        index = choice_index(self._choices, value)
+        if index is None:
+            raise refused(self.names[0], value, self._param)
+        return self._typed(self._choices[index])
+
+    def _put(self, value: Any) -> None:
+        self._exact, self._index = value, choice_index(self._choices, value)
+        setattr(self._box, self._trait, self._index)
+
+    def _typed(self, choice: Any) -> Any:
+        """Return a choice; as a scalar of NumPy where the value was one and the choice is the same number as such."""
+        if self._numpy_type is None or not isinstance(choice, bool | int | float | str):
+            return choice
+        try:
+            typed = self._numpy_type(choice)
+        except (OverflowError, ValueError):
+            return choice
+        return typed if typed == choice else choice
+
+
+def choice_index(choices: tuple[Any, ...], value: Any) -> int | None:
+    """Return the index of a value: of the same one, else of the first that equals it; None if there is none."""
+    same = next((index for index, choice in enumerate(choices) if is_same(choice, value)), None)
+    if same is not None:
+        return same
+    return next((index for index, choice in enumerate(choices) if _equals(choice, value)), None)
+
+
+def _equals(choice: Any, value: Any) -> bool:
+    try:
+        return _is_truth(choice) == _is_truth(value) and bool(choice == value)
+    except Exception:  # an array, or a class of one's own: it is another value
+        return False
+
+
+def _is_truth(value: Any) -> bool:
+    return isinstance(value, bool) or getattr(numpy_type(value), "__name__", "") in ("bool", "bool_")
+
+
+def _label(choice: Any) -> str:
+    if isinstance(choice, enum.Enum):
+        return choice.name
+    return choice if isinstance(choice, str) and choice.strip() else short_repr(choice)
+
+
+def is_short_text(value: Any) -> bool:
+    """Whether a value is a text that a box can hold."""
+    return isinstance(value, str) and len(value) <= _MAX_TEXT
+
+
+class TextControl(Control):
+    """A box of text, which commits on Enter or when it is left."""
+
+    def __init__(self, name: str, value: str, param: Text, first: Any, appearance: Mapping[str, Any]) -> None:
+        # A box of one line drops the ends of lines as soon as the user types into it.
+        box = ipywidgets.Textarea if "\n" in value else ipywidgets.Text
+        self._box = box(value=sendable(value), continuous_update=False, **appearance)
+        self._exact, self._shown, self._typed = value, self._box.value, same_type(value)
+        super().__init__((name,), (param,), self._box, (first,), "text")
+
+    def _get(self) -> Any:
+        text = self._box.value
+        return self._exact if text == self._shown else self._typed(text)
+
+    def _check(self, value: Any) -> Any:
+        if not isinstance(value, str):
+            raise refused(self.names[0], value, Text())
+        return self._typed(value)
+
+    def _put(self, value: Any) -> None:
+        self._exact, self._shown = value, sendable(value)
+        self._box.value = self._shown
+
+
+class LineControl(Control):
+    """A line that shows a value as text: a rectangle, which is moved on the picture, or what only code can set."""
+
+    def __init__(self, name: str, value: Any, param: Range, first: Any, appearance: Mapping[str, Any]) -> None:
+        self._param, self._value = param, value
+        self._line = ipywidgets.HTML(value=self._text(value), **appearance)
+        self._line.add_class("epypes-read-only")
+        super().__init__((name,), (param,), self._line, (first,), "roi" if isinstance(param, Roi) else "shown")
+
+    def _get(self) -> Any:
+        return self._value
+
+    def _check(self, value: Any) -> Any:
+        if isinstance(self._param, Roi):
+            if not allows(self._param, value):
+                way_out = "Give (x, y, width, height) in whole pixels, none of them negative."
+                raise ValueError(f"{self.names[0]!r} can't be {short_repr(value)}: it is a rectangle. {way_out}")
+            return (list if isinstance(self._value, list) else tuple)(map(int, value))
+        if self._param is not None and not allows(self._param, value):
+            raise refused(self.names[0], value, self._param)
+        return value
+
+    def _put(self, value: Any) -> None:
+        self._value, self._line.value = value, self._text(value)
+
+    def _text(self, value: Any) -> str:
+        if isinstance(self._param, Roi) and allows(self._param, value):
+            x, y, width, height = value
+            return f"x {x}, y {y}, {width} x {height}"
+        return html.escape(sendable(short_repr(value)))

@@ -1,18 +1,19 @@
-"""Where on a slider is a value, and which value does a place mean?"""
+"""The values of one hyperparameter along a slider: which position a value has, and which value a position means."""
 
 from __future__ import annotations
 
 import math
+import numbers
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
 from epypes.display.previews.short import short_repr
 from epypes.hints import Param, odd_step
-from epypes_widgets.controls.kinds import like, limits, plain
-from epypes_widgets.movable import is_integer, is_number
-from epypes_widgets.ranges import allows, described
+from epypes_widgets.ranges import allows, range_text
+from epypes_widgets.values import is_integer, is_number, numpy_type
 
-# A browser's numbers are floats: whole ones beyond this can't be told from their neighbours.
+# A browser's numbers are floats: whole ones beyond this are the same as their neighbours.
 _LAST_WHOLE: Final = 2**53
 # What a power of ten may be, so that neither it nor what is near to it is 0 or infinite.
 _EXPONENTS: Final = (-300.0, 308.0)
@@ -29,7 +30,7 @@ class Scale:
     param
         Its range.
     first
-        The value that says of which type the others are.
+        A value of the type that all others get.
     integer
         Whether all values are whole.
     low, high
@@ -59,17 +60,17 @@ class Scale:
         return int(value) if self.integer else float(value)
 
     def meant(self, place: float) -> Any:
-        """Return the value that a hand means which moved the slider to a place."""
+        """Return the value that a user means by moving the slider to a position."""
         number = round(place) if self.integer else self._rounded(place)
         if self.param.odd:
             number = round(number) | 1
-        return like(self.first)(min(max(number, self.bottom), self.top))
+        return same_type(self.first)(min(max(number, self.bottom), self.top))
 
     def _rounded(self, place: float) -> float:
         """Return the shortest decimal number that is surely meant by a place."""
         if not self.param.log:
             return without_noise(place, self.step)
-        # Two places differ by this share of them; digits far below it are of the scale, not of the hand.
+        # Two places differ by this share of them; digits far below it are of the scale, not of the user.
         share = math.expm1(self.step * math.log(10))
         return float(f"{place:.{max(3, 2 - math.floor(math.log10(share)))}g}")
 
@@ -82,19 +83,19 @@ class Scale:
             It takes no such value.
         """
         if not is_number(value):
-            raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it takes numbers, {described(self.param)}.")
+            raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it takes numbers, {range_text(self.param)}.")
         if self.integer and value != int(value):
             way_out = f"Give tune() a range of floats for it, as ({self.bottom:.1f}, {self.top:.1f})."
             raise ValueError(f"{self.name!r} takes whole numbers, not {short_repr(value)}. {way_out}")
-        number = int(value) if self.integer else plain(value)
+        number = int(value) if self.integer else _item(value)
         if not allows(self.param, number):
             raise refused(self.name, value, self.param)
-        least, greatest = limits(self.first)
+        least, greatest = _limits(self.first)
         if not least <= number <= greatest:
             kind = type(self.first).__name__
             way_out = f"Set the runner to a number of Python first: runner[{self.name!r}] = {self.first.item()!r}"
             raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it is of type {kind}. {way_out}")
-        return like(self.first)(number)
+        return same_type(self.first)(number)
 
     def grown(self, low: float, high: float, value: Any) -> tuple[float, float]:
         """Return ends of a slider that hold a value, by whole steps, so that the places between stay where they are."""
@@ -110,7 +111,7 @@ class Scale:
 
 def scale(name: str, value: Any, param: Param) -> Scale | None:
     """Return the scale of a hyperparameter; None if there is nothing to be moved, or no slider could do it."""
-    if param.choices is not None or not is_number(value) or not allows(param, plain(value)):
+    if param.choices is not None or not is_number(value) or not allows(param, _item(value)):
         return None
     whole = all(end is None or is_integer(end) for end in (param.low, param.high, param.step))
     integer = param.odd or (is_integer(value) and whole)
@@ -126,10 +127,15 @@ def scale(name: str, value: Any, param: Param) -> Scale | None:
     return Scale(name, param, value, integer, *grown, bottom, top, step)
 
 
+def same_type(value: Any) -> Callable[[Any], Any]:
+    """Return what converts a new value to the type of ``value``, if that is a scalar of NumPy."""
+    return numpy_type(value) or (lambda new: new)
+
+
 def refused(name: str, value: Any, param: Any) -> ValueError:
     """Return the error for a value outside of a range."""
     return ValueError(
-        f"{name!r} can't be {short_repr(value)}: its range is {described(param)}. Give tune() a wider hint for it."
+        f"{name!r} can't be {short_repr(value)}: its range is {range_text(param)}. Give tune() a wider hint for it."
     )
 
 
@@ -140,13 +146,31 @@ def exponent(value: Any) -> float:
 
 
 def without_noise(place: float, step: float) -> float:
-    """Return what a hand on a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
+    """Return what a user of a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
     near = float(f"{place:.12g}")
     return near if abs(near - place) <= min(step / 4, 64 * math.ulp(place)) else place
 
 
+def _item(number: Any) -> Any:
+    """Return a number of NumPy as Python's: NumPy's overflow when compared with greater ones."""
+    return number if numpy_type(number) is None else number.item()
+
+
+def _limits(value: Any) -> tuple[float, float]:
+    """Return the least and the greatest number of a value's type."""
+    kind = numpy_type(value)
+    if kind is None or not isinstance(value, numbers.Real):
+        return -math.inf, math.inf
+    import numpy as np
+
+    if issubclass(kind, np.integer):
+        return int(np.iinfo(kind).min), int(np.iinfo(kind).max)
+    ends: Any = np.finfo(kind)
+    return float(ends.min), float(ends.max)
+
+
 def _hard_ends(param: Param, value: Any, integer: bool) -> tuple[float, float]:
-    least, greatest = limits(value)
+    least, greatest = _limits(value)
     low = least if param.low is None else max(param.low, least)
     high = greatest if param.high is None else min(param.high, greatest)
     if not integer:

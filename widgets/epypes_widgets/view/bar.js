@@ -1,28 +1,39 @@
-// What can be switched and asked for above the picture?
-import { element, iconButton, note, say, textButton } from "./elements.js";
+// The toolbar above the picture: live, undo and redo, zoom, comparison, histogram, marks, probe, rectangle; and its keys.
 import { targetLabel } from "./compare.js";
+import { consume, element, iconButton, note, say, textButton } from "./elements.js";
 
 const PERCENT = 100;
+const TYPED_IN = "input, select, textarea";
+const PANS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
-/** The toolbar: live, undo and redo, zoom, comparison, histogram, marks, probe, rectangle. */
-export function barPart(panel, parts) {
-  const { stage, compare, histogram, probe, roi } = parts;
-  const live = element("button", "epypes-button epypes-worded epypes-live-switch", { type: "button", role: "switch", "aria-checked": "true", title: "Compute while values are moved" }, element("span", "epypes-lamp", { "aria-hidden": "true" }), "Live");
-  const run = textButton("Run", () => panel.send({ kind: "run" }), "epypes-run", "Compute the values now");
-  const undo = iconButton("undo", "Undo", () => panel.send({ kind: "undo" }), "epypes-undo");
-  const redo = iconButton("redo", "Redo", () => panel.send({ kind: "redo" }), "epypes-redo");
-  const reset = iconButton("reset", "Reset all to default", () => panel.send({ kind: "reset", names: [] }), "epypes-reset-all");
-  const scale = element("button", "epypes-button epypes-worded epypes-scale", { type: "button", title: "Pixel for pixel (1)", "aria-label": "Pixel for pixel" }, "100 %");
-  const select = element("select", "epypes-compare", { "aria-label": "Compare with", title: "Compare with" });
-  const flip = iconButton("flip", "Flip to the other picture while held (f)", () => undefined, "epypes-flip");
-  const wipe = iconButton("wipe", "Wipe between the two pictures (w)", () => compare.toggle("wipe"), "epypes-wipe");
-  const side = iconButton("side", "Side by side (s)", () => compare.toggle("side"), "epypes-side-button");
-  const bars = iconButton("histogram", "Histogram (h)", () => toggle(histogram), "epypes-histogram-button");
-  const log = iconButton("log", "Logarithmic counts (l)", () => toggleLog(), "epypes-log-button");
-  const marks = iconButton("marks", "Marks on the picture (o)", () => toggleMarks(), "epypes-marks-button");
-  const probed = iconButton("probe", "Values of the pixel under the pointer (p: by keys)", () => toggle(probe), "epypes-probe-button");
-  const draw = iconButton("roi", "Draw a rectangle (r)", () => toggle(roi), "epypes-roi-button");
+export function barPart(panel, { stage, compare, histogram, probe, roi }) {
   const group = (label, ...children) => element("span", "epypes-group", { role: "group", "aria-label": label }, ...children);
+  const asking = (icon, label, message, name) => iconButton(icon, label, () => panel.send(message), name);
+  const toggling = (icon, label, toggle, name) => iconButton(icon, label, () => (toggle(), refresh()), name);
+  const toggle = {
+    histogram: () => histogram.toggle(),
+    log: () => histogram.toggleLog(),
+    marks: () => stage.box.classList.toggle("epypes-without-marks"),
+    cross: () => probe.toggleCross(),
+    roi: () => roi.toggle(),
+  };
+  const live = textButton("Live", onLive, "epypes-live-switch", "Compute while values are moved");
+  live.prepend(element("span", "epypes-lamp", { "aria-hidden": "true" }));
+  live.setAttribute("role", "switch");
+  const run = textButton("Run", () => panel.send({ kind: "run" }), "epypes-run", "Compute the values now");
+  const undo = asking("undo", "Undo", { kind: "undo" }, "epypes-undo");
+  const redo = asking("redo", "Redo", { kind: "redo" }, "epypes-redo");
+  const reset = asking("reset", "Reset all to default", { kind: "reset", names: [] }, "epypes-reset-all");
+  const scale = textButton("100 %", stage.actualSize, "epypes-scale", "Pixel for pixel (1)");
+  const select = element("select", "epypes-compare", { "aria-label": "Compare with", title: "Compare with" });
+  const flip = iconButton("flip", "Flip to the other picture while held (f)", () => undefined);
+  const wipe = toggling("wipe", "Wipe between the two pictures (w)", () => compare.toggle("wipe"), "epypes-wipe");
+  const side = toggling("side", "Side by side (s)", () => compare.toggle("side"), "epypes-side-button");
+  const bars = toggling("histogram", "Histogram (h)", toggle.histogram, "epypes-histogram-button");
+  const log = toggling("log", "Logarithmic counts (l)", toggle.log);
+  const marks = toggling("marks", "Marks on the picture (o)", toggle.marks);
+  const probed = toggling("probe", "Values of the pixel under the pointer (p: by keys)", () => probe.toggle());
+  const draw = toggling("roi", "Draw a rectangle (r)", toggle.roi, "epypes-roi-button");
   const root = element(
     "div",
     "epypes-bar",
@@ -35,104 +46,105 @@ export function barPart(panel, parts) {
   );
   let isLive = true;
   let isClosed = false;
-  let areMarksOn = true;
+  let past = { undo: false, redo: false, entries: [] };
   let stages = [];
-  let entries = [];
 
-  const press = (button, on) => note(button, "aria-pressed", String(Boolean(on)));
+  function onLive() {
+    isLive = !isLive;
+    panel.send({ kind: "live", on: isLive });
+    refresh();
+  }
 
-  function show() {
-    press(wipe, compare.mode === "wipe");
-    press(side, compare.mode === "side");
-    press(flip, compare.isFlipped);
-    press(bars, histogram.isOn);
-    press(log, histogram.isLogarithmic);
-    press(marks, areMarksOn);
-    press(probed, probe.isOn);
-    press(draw, roi.isDrawing);
+  function refresh() {
+    const pressed = [
+      [wipe, compare.mode === "wipe"], [side, compare.mode === "side"], [flip, compare.isFlipped], [bars, histogram.isOn],
+      [log, histogram.isLogarithmic], [marks, !stage.box.matches(".epypes-without-marks")], [probed, probe.isOn], [draw, roi.isDrawing],
+    ];
+    for (const [button, on] of pressed) note(button, "aria-pressed", on);
+    note(live, "aria-checked", isLive && !isClosed);
     log.disabled = !histogram.isOn;
     draw.disabled = !roi.exists;
     live.disabled = reset.disabled = select.disabled = isClosed;
     run.disabled = isLive || isClosed;
-    note(live, "aria-checked", String(isLive && !isClosed));
-    choices();
+    undo.disabled = !past.undo || isClosed;
+    redo.disabled = !past.redo || isClosed;
+    offer();
   }
 
-  function toggle(part) {
-    part.toggle();
-    show();
-  }
-
-  function toggleLog() {
-    histogram.toggleLog();
-    show();
-  }
-
-  function toggleMarks() {
-    areMarksOn = !areMarksOn;
-    stage.box.classList.toggle("epypes-without-marks", !areMarksOn);
-    show();
-  }
-
-  function toggleProbe() {
-    probe.toggleCross();
-    show();
-  }
-
-  function choices() {
-    const targets = [null, { kind: "default" }, ...stages.map((token) => ({ kind: "stage", token })), ...entries.map((number) => ({ kind: "history", number }))];
-    if (compare.target && !targets.some((one) => targetLabel(one) === targetLabel(compare.target))) targets.push(compare.target);
+  function offer() {
+    const targets = [
+      null, { kind: "default" }, ...stages.map((token) => ({ kind: "stage", token })), ...past.entries.map(({ number }) => ({ kind: "history", number })),
+    ];
+    if (!targets.some((one) => targetLabel(one) === targetLabel(compare.target))) targets.push(compare.target);
     const key = JSON.stringify(targets);
     if (select.dataset.key !== key) {
       select.dataset.key = key;
-      select.replaceChildren(
-        ...targets.map((target) => element("option", "", { value: JSON.stringify(target) }, target ? `with ${targetLabel(target)}` : "Compare…")),
-      );
+      const label = (target) => (target ? `with ${targetLabel(target)}` : "Compare…");
+      select.replaceChildren(...targets.map((target) => element("option", "", { value: JSON.stringify(target) }, label(target))));
     }
     select.value = JSON.stringify(compare.target);
   }
 
-  live.addEventListener("click", () => {
-    isLive = !isLive;
-    panel.send({ kind: "live", on: isLive });
-    show();
-  });
-  scale.addEventListener("click", stage.actualSize);
   select.addEventListener("change", () => compare.choose(JSON.parse(select.value)));
   // A button that works while it is held, by the pointer or by a key.
   flip.addEventListener("pointerdown", () => compare.flip(true));
   flip.addEventListener("keydown", (event) => [" ", "Enter"].includes(event.key) && compare.flip(true));
   for (const end of ["pointerup", "pointercancel", "pointerleave", "keyup", "blur"]) flip.addEventListener(end, () => compare.flip(false));
-  compare.watch(show);
-  roi.watch(show);
-  histogram.watch(show);
-  let scheduled = false;
-  stage.watch(() => {
-    if (scheduled) return;
-    scheduled = true;
-    setTimeout(() => {
-      scheduled = false;
-      say(scale, `${Math.round(stage.place.scale * PERCENT)} %`);
-    });
-  });
+  stage.watch(() => say(scale, `${Math.round(stage.place.scale * PERCENT)} %`));
 
-  function history(message) {
-    undo.disabled = !message.undo || isClosed;
-    redo.disabled = !message.redo || isClosed;
-    const numbers = message.entries ?? (Array.isArray(message.history) ? message.history : message.history?.entries);
-    if (numbers) entries = numbers.map(({ number }) => number);
-    show();
+  const keys = {
+    "+": stage.zoomIn, "=": stage.zoomIn, "-": stage.zoomOut, 0: stage.fit, 1: stage.actualSize,
+    h: toggle.histogram, l: toggle.log, o: toggle.marks, p: toggle.cross, r: toggle.roi,
+    w: () => compare.toggle("wipe"), s: () => compare.toggle("side"), f: () => compare.flip(true),
+    escape() {
+      roi.stop();
+      if (probe.isCrossed) probe.toggleCross();
+    },
+  };
+
+  /** Do what a key means; return whether it means anything here. */
+  function act(event) {
+    const key = event.key.toLowerCase();
+    if (event.ctrlKey || event.metaKey) {
+      if (isTheirs(event)) return false;
+      panel.send({ kind: key === "y" || event.shiftKey ? "redo" : "undo" });
+    } else if (event.key in PANS) {
+      if (event.target !== stage.box) return false;
+      const [right, down] = PANS[event.key];
+      if (!(event.shiftKey && probe.moveCross(right, down, event.altKey))) stage.pan(right, down);
+    } else {
+      if (!keys[key] || event.altKey) return false;
+      if (!event.repeat || "+-=".includes(key)) keys[key]();
+      refresh();
+    }
+    return true;
   }
+
+  /** JupyterLab's own shortcuts are left alone where no key of the view is meant: Ctrl+S still saves. */
+  const isTheirs = (event) => (event.ctrlKey || event.metaKey) && !["z", "y"].includes(event.key.toLowerCase());
 
   return {
     element: root,
+    refresh,
+    /** Handle the keys of a figure until the signal; those of its sliders and lists have been handled below. */
+    listen(figure, signal) {
+      figure.addEventListener("keydown", (event) => {
+        if (!event.defaultPrevented && !event.target.closest(TYPED_IN) && act(event)) consume(event);
+      });
+      const onEarly = (event) => figure.contains(event.target) && figure.toggleAttribute("data-lm-suppress-shortcuts", !isTheirs(event));
+      const unflip = (event) => (event.type === "blur" || event.key.toLowerCase() === "f") && compare.flip(false);
+      window.addEventListener("keydown", onEarly, { capture: true, signal });
+      for (const end of ["keyup", "blur"]) window.addEventListener(end, unflip, { signal });
+    },
     setup(message) {
       isLive = message.live;
-      isClosed = Boolean(message.closed);
+      isClosed = message.closed;
       stages = message.stages.filter(({ is_picture }) => is_picture).map(({ token }) => token);
-      history(message);
+      refresh();
     },
-    history,
-    toggle: { histogram: () => toggle(histogram), log: toggleLog, marks: toggleMarks, probe: toggleProbe, roi: () => toggle(roi) },
+    history(message) {
+      past = message;
+      refresh();
+    },
   };
 }

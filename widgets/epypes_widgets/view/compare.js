@@ -1,8 +1,7 @@
-// How is the picture compared with another one: by flip, by wipe, or side by side?
-import { decoded } from "./blobs.js";
-import { element, follow, note, say } from "./elements.js";
-import { wiped } from "./geometry.js";
-import { same, shortly } from "./numbers.js";
+// The picture compared with another one: by flip, by wipe, or side by side.
+import { consume, element, follow, note, say } from "./elements.js";
+import { clear, swap } from "./frames.js";
+import { same } from "./numbers.js";
 import { drawOverlay } from "./overlay.js";
 import { newestOnly } from "./protocol.js";
 
@@ -12,19 +11,13 @@ const KEY_SHARE = 0.02;
 export function targetLabel(target) {
   if (!target) return "nothing";
   if (target.kind === "stage") return target.token;
-  return target.kind === "history" ? `history #${shortly(target.number)}` : "default";
+  return target.kind === "history" ? `history #${target.number}` : "default";
 }
 
 /** The second picture, and the ways of looking at it. */
 export function comparePart(panel, stage) {
   const divider = element("div", "epypes-divider", {
-    role: "slider",
-    tabindex: "0",
-    "aria-label": "Wipe between the two pictures",
-    "aria-valuemin": "0",
-    "aria-valuemax": "100",
-    "aria-orientation": "horizontal",
-    hidden: "",
+    role: "slider", tabindex: "0", "aria-label": "Wipe between the two pictures", "aria-valuemin": "0", "aria-valuemax": "100", hidden: "",
   });
   const here = element("span", "epypes-which epypes-which-here", { hidden: "" });
   const there = element("span", "epypes-which epypes-which-there", { hidden: "" });
@@ -37,37 +30,29 @@ export function comparePart(panel, stage) {
   let label = "";
   let isThere = false;
   const isNewest = newestOnly();
-  const watchers = [];
 
-  function clip() {
-    if (mode !== "wipe" || isFlipped) {
-      stage.layer.style.clipPath = "";
-      return;
-    }
+  function wipe(next = share) {
+    share = Math.min(1, Math.max(0, next));
+    const covered = share * stage.room.width - stage.place.x;
+    stage.layer.style.clipPath = mode === "wipe" && !isFlipped ? `inset(0 0 0 ${covered}px)` : "";
     divider.style.left = `${share * stage.room.width}px`;
-    note(divider, "aria-valuenow", String(Math.round(share * 100)));
-    stage.layer.style.clipPath = `inset(0 0 0 ${wiped(share, stage.room, stage.place)}px)`;
+    note(divider, "aria-valuenow", Math.round(share * 100));
   }
 
   function arrange() {
     const isSide = isThere && mode === "side";
+    const isCovered = isFlipped && !isSide;
     const home = isSide ? stage.secondCanvas : stage.canvas;
-    if (stage.layer.parentElement !== home) {
-      if (isSide) home.append(stage.layer);
-      else stage.overlay.after(stage.layer);
-    }
+    if (stage.layer.parentElement !== home) home.insertBefore(stage.layer, isSide ? null : stage.roi);
     stage.secondPane.hidden = !isSide;
-    stage.box.classList.toggle("epypes-side", isSide);
-    stage.box.classList.toggle("epypes-wiping", isThere && mode === "wipe");
-    stage.box.classList.toggle("epypes-flipped", isThere && isFlipped);
-    stage.layer.hidden = !isThere || (!isSide && mode !== "wipe" && !isFlipped);
+    stage.layer.hidden = !isThere || (!mode && !isFlipped);
     divider.hidden = !isThere || mode !== "wipe";
-    here.hidden = there.hidden = !isThere || (!mode && !isFlipped);
-    say(here, isFlipped && !isSide ? `B  ${label}` : "A  now");
+    here.hidden = stage.layer.hidden;
+    there.hidden = here.hidden || isCovered;
+    say(here, isCovered ? `B  ${label}` : "A  now");
     say(there, `B  ${label}`);
-    there.hidden ||= isFlipped && !isSide;
-    clip();
-    for (const watcher of watchers) watcher();
+    wipe();
+    panel.refresh();
   }
 
   function choose(next, wanted = mode) {
@@ -79,10 +64,7 @@ export function comparePart(panel, stage) {
     }
     mode = target ? wanted : "";
     isFlipped &&= Boolean(target);
-    if (!target) {
-      stage.other.removeAttribute("src");
-      panel.blobs.put(stage.other, "");
-    }
+    if (!target) clear(stage.other);
     arrange();
   }
 
@@ -91,20 +73,17 @@ export function comparePart(panel, stage) {
   follow(divider, () => ({
     move(event) {
       const at = stage.pane.getBoundingClientRect();
-      share = Math.min(1, Math.max(0, (event.clientX - at.left) / at.width));
-      clip();
+      wipe((event.clientX - at.left) / at.width);
     },
   }));
   divider.addEventListener("keydown", (event) => {
     const step = event.shiftKey ? 10 * KEY_SHARE : KEY_SHARE;
-    const moves = { ArrowLeft: share - step, ArrowRight: share + step, Home: 0, End: 1 };
-    if (!(event.key in moves)) return;
-    event.preventDefault();
-    event.stopPropagation();
-    share = Math.min(1, Math.max(0, moves[event.key]));
-    clip();
+    const next = { ArrowLeft: share - step, ArrowRight: share + step, Home: 0, End: 1 }[event.key];
+    if (next === undefined) return;
+    consume(event);
+    wipe(next);
   });
-  stage.watch(clip);
+  stage.watch(wipe);
 
   return {
     choose: (next) => choose(next, mode || "wipe"),
@@ -116,24 +95,19 @@ export function comparePart(panel, stage) {
       else arrange();
     },
     /** Show the bytes of the second picture; those of an older message don't replace newer ones. */
-    async take(picture, bytes, seq, said = "") {
-      const isStage = picture.role === "other" && !said;
-      const isAsked = target && (isStage ? target.token === picture.token : target.kind !== "stage");
+    async take(picture, bytes, seq, reference = "") {
+      const isAsked = target && (reference ? target.kind !== "stage" : target.token === picture.token);
       if (!isAsked || !bytes || !isNewest(seq)) return;
       const asked = target;
-      const url = panel.blobs.open(bytes, picture.media_type);
-      const ready = await decoded(url);
-      if (!ready || asked !== target || !isNewest(seq)) return panel.blobs.close(url);
-      stage.other.src = url;
-      panel.blobs.put(stage.other, url);
+      if (!(await swap(stage.other, bytes, picture.media_type))) return;
+      if (asked !== target) return choose(target);
       drawOverlay(stage.otherMarks, picture.overlay);
-      stage.other.alt = `${picture.token}, compared with: ${said || label}`;
+      stage.other.alt = `${picture.token}, compared with: ${reference || label}`;
       stage.other.dataset.seq = String(seq);
       isThere = true;
-      label = said || label;
+      label = reference || label;
       arrange();
     },
-    watch: (watcher) => watchers.push(watcher),
     get target() { return target; },
     get mode() { return mode; },
     get isFlipped() { return isFlipped; },

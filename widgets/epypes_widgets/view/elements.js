@@ -1,6 +1,8 @@
-// How is an element made, and its text changed only when it differs?
+// Elements: made in one call, changed only where they differ, dragged, and walked along by arrow keys.
 
-const SVG_NAMESPACE = "http://www.w3.org/2000/svg";
+const SVG = "http://www.w3.org/2000/svg";
+const FIRST_ANSWER_MS = 500;
+const LAST_ANSWER_MS = 8000;
 
 /** Strokes in a square of 16 by 16. */
 const ICONS = {
@@ -19,70 +21,50 @@ const ICONS = {
   pin: "M6 2.5h4l-.6 4 2.1 2.2H4.5l2.1-2.2zM8 8.7v5",
   reset: "M3.2 6.2A5.2 5.2 0 1 1 2.8 9M3 2.6v3.8h3.8",
   copy: "M5.5 5.5h8v8h-8zM10.5 5.5v-3h-8v8h3",
-  run: "M4.5 2.8v10.4L13 8z",
   log: "M3 13V3M3 13h10M5.5 10.5 8 7l2 1.6 3-5",
 };
 
-/**
- * @param {string} tag
- * @param {string} [name] its classes
- * @param {Record<string, string>} [attributes]
- * @param {...(Node | string)} children
- * @returns {any}
- */
-export function element(tag, name = "", attributes = {}, ...children) {
-  const made = document.createElement(tag);
-  if (name) made.className = name;
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  made.append(...children);
-  return made;
-}
-
-/**
- * @param {string} tag of SVG
- * @param {Record<string, string | number>} [attributes]
- * @param {...Node} children
- * @returns {any}
- */
-export function shape(tag, attributes = {}, ...children) {
-  const made = document.createElementNS(SVG_NAMESPACE, tag);
+function built(made, attributes, children) {
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, String(value));
   made.append(...children);
   return made;
 }
 
-/** Write a text only when it changes: a screen reader would say it again, and the browser lay it out again. */
+/** @returns {any} an element with these classes */
+export function element(tag, name = "", attributes = {}, ...children) {
+  const made = built(document.createElement(tag), attributes, children);
+  if (name) made.className = name;
+  return made;
+}
+
+/** @returns {any} an element of SVG */
+export function shape(tag, attributes = {}, ...children) {
+  return built(document.createElementNS(SVG, tag), attributes, children);
+}
+
+/** Write a text only when it changes: a screen reader would read it again, and the browser lay it out again. */
 export function say(node, text) {
   if (node && node.textContent !== text) node.textContent = text;
 }
 
 /** Set an attribute only when it changes. */
 export function note(node, name, value) {
-  if (node && node.getAttribute(name) !== value) node.setAttribute(name, value);
+  if (node && node.getAttribute(name) !== String(value)) node.setAttribute(name, String(value));
 }
 
-/** @param {keyof typeof ICONS} name */
 export function icon(name) {
   return shape("svg", { viewBox: "0 0 16 16", class: "epypes-icon", "aria-hidden": "true" }, shape("path", { d: ICONS[name] }));
 }
 
-/**
- * A button with a picture and a name that is said and shown as a tooltip.
- * @param {string} drawn the icon's name
- * @param {string} label
- * @param {(event: any) => void} press
- * @param {string} [name] classes
- */
+/** A button with a picture, and a name that is its tooltip. */
 export function iconButton(drawn, label, press, name = "") {
-  const made = element("button", `epypes-button ${name}`.trim(), { type: "button", "aria-label": label, title: label }, icon(drawn));
+  const made = element("button", `epypes-button ${name}`, { type: "button", "aria-label": label, title: label }, icon(drawn));
   made.addEventListener("click", press);
   return made;
 }
 
-/** @param {string} text @param {(event: any) => void} press @param {string} [name] @param {string} [title] */
 export function textButton(text, press, name = "", title = "") {
-  const made = element("button", `epypes-button epypes-worded ${name}`.trim(), { type: "button" }, text);
-  if (title) made.title = title;
+  const made = element("button", `epypes-button epypes-worded ${name}`, { type: "button", title }, text);
   made.addEventListener("click", press);
   return made;
 }
@@ -90,21 +72,84 @@ export function textButton(text, press, name = "", title = "") {
 /** Make a node follow the pointer from a press to its release, wherever that happens. */
 export function follow(node, begin) {
   node.addEventListener("pointerdown", (event) => {
-    if (event.button !== 0) return;
-    const drag = begin(event);
+    const drag = event.button === 0 && begin(event);
     if (!drag) return;
     event.preventDefault();
-    event.stopPropagation();
+    event.stopImmediatePropagation();
     const moved = (later) => drag.move(later);
-    const ended = (later) => {
-      node.removeEventListener("pointermove", moved);
-      for (const end of ENDS) node.removeEventListener(end, ended);
-      drag.end?.(later);
-    };
     node.setPointerCapture(event.pointerId);
     node.addEventListener("pointermove", moved);
-    for (const end of ENDS) node.addEventListener(end, ended);
+    const ended = () => {
+      node.removeEventListener("pointermove", moved);
+      drag.end?.();
+    };
+    node.addEventListener("lostpointercapture", ended, { once: true });
   });
 }
 
-const ENDS = ["pointerup", "pointercancel", "lostpointercapture"];
+/** Move the focus among the elements of a selector by arrow keys, Home and End. */
+export function walkAlong(root, selector, arrived = (_node) => undefined) {
+  root.addEventListener("keydown", (event) => {
+    const all = [...root.querySelectorAll(selector)];
+    const at = all.indexOf(document.activeElement);
+    const next = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: all.length - 1 }[event.key];
+    if (at < 0 || next === undefined) return;
+    consume(event);
+    const node = all[(next + all.length) % all.length];
+    node.focus();
+    arrived(node);
+  });
+}
+
+/** Keep an event from the browser, and from JupyterLab. */
+export function consume(event) {
+  event.preventDefault();
+  event.stopPropagation();
+}
+
+/** Show bytes in an image; nothing for no bytes. */
+export function fill(img, bytes, type = "image/jpeg") {
+  if (!bytes?.byteLength) return img.removeAttribute("src");
+  const url = URL.createObjectURL(new Blob([bytes], { type }));
+  // Also when another picture is loaded in the place of this one.
+  for (const end of ["load", "error"]) img.addEventListener(end, () => URL.revokeObjectURL(url), { once: true });
+  img.src = url;
+  return undefined;
+}
+
+/** Call back with the closest element of a selector once a node is in the page; return what ends that. */
+export function whenInside(node, selector, found) {
+  const sizes = new ResizeObserver(() => {
+    const outer = node.closest(selector);
+    if (!outer) return;
+    sizes.disconnect();
+    found(outer);
+  });
+  sizes.observe(node);
+  return () => sizes.disconnect();
+}
+
+/**
+ * Send "ready" until it is answered, and hide the static output below a living view; return what ends both.
+ *
+ * Until JupyterLab has a thread for widgets beside that of the cells, a message waits for a cell that runs: then it is
+ * sent again, and the thread that is there by then handles it.
+ */
+export function mounted(root, live, send) {
+  let knocking = 0;
+  let area = null;
+  const knock = (answer_ms) => {
+    send({ kind: "ready" });
+    knocking = setTimeout(() => knock(Math.min(2 * answer_ms, LAST_ANSWER_MS)), answer_ms);
+  };
+  const stopLooking = whenInside(root, ".jp-OutputArea", (found) => (area = found).classList.add(live));
+  knock(FIRST_ANSWER_MS);
+  return {
+    answered: () => clearTimeout(knocking),
+    close() {
+      clearTimeout(knocking);
+      stopLooking();
+      area?.classList.remove(live);
+    },
+  };
+}

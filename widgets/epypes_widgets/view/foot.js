@@ -1,119 +1,138 @@
-// What is kept of the values: a line of code, named settings, a promoted graph, and a log of the panel?
+// The foot of the view: a line of code, named settings, promoting or writing back, and a log.
 import { element, iconButton, note, say, textButton } from "./elements.js";
-import { writeBackPart } from "./writeback.js";
 
 const COPIED_MS = 1500;
+const DIFF_LINES = [["---", "epypes-diff-file"], ["+++", "epypes-diff-file"], ["+", "epypes-added"], ["-", "epypes-removed"]];
 
-/** Copies without the page's permission where the browser has no clipboard for it. */
-async function copy(text) {
-  try {
-    await navigator.clipboard.writeText(text);
-    return true;
-  } catch {
-    const area = element("textarea", "", { style: "position:fixed;opacity:0" });
-    area.value = text;
-    document.body.append(area);
-    area.select();
-    const isDone = document.execCommand("copy");
-    area.remove();
-    return isDone;
+function tell(node, text, isGood = true) {
+  say(node, text && !isGood ? `! ${text}` : text);
+  node.title = text;
+  node.classList.toggle("epypes-refused", !isGood);
+}
+
+const outcome = (name = "epypes-outcome") => element("span", `epypes-message ${name}`, { role: "status" });
+const line = (status, ...asking) => element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, ...asking), status);
+
+function settingsLine(panel) {
+  const list = element("datalist", "", { id: `epypes-settings-${Math.random().toString(36).slice(2)}` });
+  const name = element("input", "epypes-input epypes-setting", { type: "text", "aria-label": "Name of the settings", placeholder: "name of settings", list: list.id, spellcheck: "false" });
+  const save = textButton("Save", () => onSetting("save"), "epypes-save", "Save the values as a TOML file");
+  const load = textButton("Load", () => onSetting("load"), "epypes-load", "Load saved values");
+  const status = outcome("epypes-setting-message");
+
+  function onSetting(kind) {
+    const asked = name.value.trim();
+    if (asked) panel.send({ kind, name: asked });
+    else tell(status, "Give the settings a name.", false);
   }
+
+  name.addEventListener("keydown", (event) => event.key === "Enter" && onSetting("save"));
+  return {
+    line: line(status, list, name, save, load),
+    offer: (names) => list.replaceChildren(...names.map((one) => element("option", "", { value: one }))),
+    tell: (text, isGood) => tell(status, text, isGood),
+  };
+}
+
+function promoteLine(panel) {
+  const to = element("input", "epypes-input epypes-target", { type: "text", "aria-label": "Promote to", placeholder: "folder", spellcheck: "false" });
+  const promote = textButton("Promote", onPromote, "epypes-promote", "Write the graph with these values as a folder of plain text, and check it");
+  const status = outcome();
+
+  function onPromote() {
+    promote.disabled = true;
+    tell(status, "Promoting…");
+    panel.send({ kind: "promote", to: to.value.trim() });
+  }
+
+  to.addEventListener("keydown", (event) => event.key === "Enter" && !promote.disabled && onPromote());
+  return {
+    line: line(status, to, promote),
+    propose: (folder) => (to.value ||= folder),
+    show({ state, text }) {
+      promote.disabled = state === "running";
+      tell(status, text || "Promoting…", state !== "refused");
+    },
+  };
+}
+
+/** In the place of promoting for a service: first what would change in its bundle, then the change. */
+function writeBackLine(panel) {
+  const ask = textButton("Write back", () => onAsk(true), "epypes-write-back", "Show what these values would change in pipeline.toml");
+  const write = textButton("Write", () => onAsk(false), "epypes-write", "Write it, replay the samples, and seal the bundle anew");
+  const cancel = textButton("Cancel", () => show({ state: "", text: "" }), "epypes-cancel");
+  const status = outcome();
+  const diff = element("pre", "epypes-diff", { tabindex: "0", role: "region", "aria-label": "What changes in pipeline.toml", hidden: "" });
+  const disable = (on) => [ask, write, cancel].forEach((button) => (button.disabled = on));
+
+  function onAsk(isDry) {
+    disable(true);
+    panel.send({ kind: "write_back", dry_run: isDry });
+  }
+
+  function show({ state, text, diff: changes = "" }) {
+    const isRunning = state === "running";
+    disable(isRunning);
+    ask.hidden = state === "diff" || (isRunning && !write.hidden);
+    write.hidden = cancel.hidden = !ask.hidden;
+    tell(status, text, state !== "refused");
+    if (isRunning) return;
+    diff.hidden = !changes;
+    const kind = (one) => DIFF_LINES.find(([sign]) => one.startsWith(sign))?.[1];
+    diff.replaceChildren(...changes.split("\n").map((one) => element("span", kind(one), {}, `${one}\n`)));
+  }
+
+  show({ state: "", text: "" });
+  return { line: line(status, ask, write, cancel), diff, show };
 }
 
 export function footPart(panel) {
   const code = element("code", "epypes-code");
   const copied = element("span", "epypes-copied", { role: "status" });
   const copyButton = iconButton("copy", "Copy the line of code", onCopy, "epypes-copy");
-  const list = element("datalist", "", { id: `epypes-settings-${Math.random().toString(36).slice(2)}` });
-  const name = element("input", "epypes-input epypes-setting", { type: "text", "aria-label": "Name of the settings", placeholder: "name of settings", list: list.id, spellcheck: "false" });
-  const save = textButton("Save", () => onSetting("save"), "epypes-save", "Save the values as a TOML file");
-  const load = textButton("Load", () => onSetting("load"), "epypes-load", "Load saved values");
-  const said = element("span", "epypes-said epypes-setting-said", { role: "status" });
-  const to = element("input", "epypes-input epypes-target", { type: "text", "aria-label": "Promote to", placeholder: "folder", spellcheck: "false" });
-  const promote = textButton("Promote", onPromote, "epypes-promote", "Write the graph with these values as a folder of plain text, and check it");
-  const outcome = element("span", "epypes-outcome", { role: "status" });
-  const promoting = element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, to, promote), outcome);
-  const settings = element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, list, name, save, load), said);
-  const back = writeBackPart(panel);
-  const lines = element("ol", "epypes-lines");
-  const summary = element("summary", "");
+  const settings = settingsLine(panel);
+  const promoting = promoteLine(panel);
+  const back = writeBackLine(panel);
+  const [summary, lines] = [element("summary"), element("ol", "epypes-lines")];
   const log = element("details", "epypes-log", { hidden: "" }, summary, lines);
-  const root = element(
-    "div",
-    "epypes-foot",
-    {},
-    element("div", "epypes-foot-line epypes-code-line", {}, code, copied, copyButton),
-    settings,
-    promoting,
-    back.line,
-    back.diff,
-    log,
-  );
+  const codeLine = element("div", "epypes-foot-line epypes-code-line", {}, code, copied, copyButton);
 
   async function onCopy() {
-    say(copied, (await copy(code.textContent)) ? "copied" : "not copied");
+    try {
+      await navigator.clipboard.writeText(code.textContent);
+      say(copied, "copied");
+    } catch {
+      // Without leave for the clipboard the line is selected, for Ctrl+C.
+      getSelection().selectAllChildren(code);
+      say(copied, "selected");
+    }
     setTimeout(() => say(copied, ""), COPIED_MS);
   }
 
-  function onSetting(kind) {
-    const asked = name.value.trim();
-    if (asked) panel.send({ kind, name: asked });
-    else tell(said, "Give the settings a name.", false);
-  }
-
-  function onPromote() {
-    promote.disabled = true;
-    tell(outcome, "Promoting…", true);
-    panel.send({ kind: "promote", to: to.value.trim() });
-  }
-
-  function tell(node, text, isGood) {
-    say(node, text && !isGood ? `! ${text}` : text);
-    node.title = text;
-    node.classList.toggle("epypes-refused", !isGood);
-  }
-
-  function offer(names) {
-    const key = names.join("\n");
-    if (list.dataset.key === key) return;
-    list.dataset.key = key;
-    list.replaceChildren(...names.map((one) => element("option", "", { value: one })));
-  }
-
-  name.addEventListener("keydown", (event) => event.key === "Enter" && onSetting("save"));
-  to.addEventListener("keydown", (event) => event.key === "Enter" && !promote.disabled && onPromote());
-
-  const tellCode = (text) => {
-    say(code, text ?? "");
-    note(code, "title", text ?? "");
-  };
-
   return {
-    element: root,
+    element: element("div", "epypes-foot", {}, codeLine, settings.line, promoting.line, back.line, back.diff, log),
     /** The lines that ask the kernel for something; the code can be copied and the log read without it. */
-    asking: [settings, promoting, back.line],
+    asking: [settings.line, promoting.line, back.line],
     setup(message) {
-      tellCode(message.code);
-      offer(message.settings ?? []);
-      if (!to.value) to.value = message.promote_to ?? "";
-      promoting.hidden = Boolean(message.writes_back);
-      back.setup(message);
+      settings.offer(message.settings);
+      promoting.propose(message.promote_to);
+      promoting.line.hidden = message.writes_back;
+      back.line.hidden = !message.writes_back;
     },
-    history: (message) => message.code !== undefined && tellCode(message.code),
-    settings(message) {
-      offer(message.names ?? []);
-      tell(said, message.said ?? "", message.ok);
+    history(message) {
+      say(code, message.code);
+      note(code, "title", message.code);
     },
-    promoted(message) {
-      const isRunning = message.state === "running";
-      promote.disabled = isRunning;
-      tell(outcome, isRunning ? message.text || "Promoting…" : message.text, message.state !== "refused");
+    settings({ names, text, ok }) {
+      settings.offer(names);
+      settings.tell(text, ok);
     },
-    written: back.written,
+    promoted: promoting.show,
+    written: back.show,
     log(message) {
       log.hidden = message.lines.length === 0;
       say(summary, `Log of the panel (${message.lines.length})`);
-      lines.replaceChildren(...message.lines.map((line) => element("li", "", {}, element("time", "", {}, line.at), ` ${line.text}`)));
+      lines.replaceChildren(...message.lines.map(({ at, text }) => element("li", "", {}, element("time", "", {}, at), ` ${text}`)));
     },
   };
 }

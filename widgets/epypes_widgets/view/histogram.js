@@ -1,11 +1,41 @@
-// How are the values of a stage spread, and where do the thresholds cut them?
-import { element, follow, note, say, shape } from "./elements.js";
-import { fullest, outline, shareOf, valueAt } from "./bins.js";
+// Histograms of the stage shown and of those that thresholds cut, with the thresholds as lines.
+import { consume, element, follow, note, say, shape } from "./elements.js";
 import { FAST, clamped, ends, shortly, stepped, written } from "./numbers.js";
 
 const NEAR_THE_END = 0.75;
+const LINE_KEYS = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 };
 
-/** Histograms of the stage shown and of those that thresholds cut, with the thresholds as lines. */
+/** @typedef {{low: number, high: number, bins: number, channels: {name: string, counts: number[]}[]}} Histogram */
+
+/** Return the share of the width at which a value stands, kept within 0 and 1. */
+export function shareOf(histogram, value) {
+  const span = histogram.high - histogram.low;
+  return span > 0 ? Math.min(1, Math.max(0, (value - histogram.low) / span)) : 0.5;
+}
+
+/** Return the value that stands at a share of the width. */
+export function valueAt(histogram, share) {
+  return histogram.low + Math.min(1, Math.max(0, share)) * (histogram.high - histogram.low);
+}
+
+/** Return the height of a bin, 1 for the fullest; by its logarithm, few beside many can be seen. */
+export function heightOf(count, most, isLogarithmic) {
+  if (count <= 0 || most <= 0) return 0;
+  return isLogarithmic ? Math.log1p(count) / Math.log1p(most) : count / most;
+}
+
+/** Return the outline of a channel as an SVG path, in a square of 1 by 1. */
+export function outline(counts, most, isLogarithmic) {
+  const digits = (number) => Number(number.toFixed(4));
+  const bins = counts.map((count, bin) => `V${digits(1 - heightOf(count, most, isLogarithmic))}H${digits((bin + 1) / counts.length)}`);
+  return `M0 1${bins.join("")}V1Z`;
+}
+
+/** Return the largest count of all channels. */
+export function fullest(histogram) {
+  return histogram.channels.reduce((most, channel) => channel.counts.reduce((a, b) => Math.max(a, b), most), 0);
+}
+
 export function histogramPart(panel) {
   const root = element("div", "epypes-histograms", { hidden: "" });
   /** @type {Map<string, any>} by token */
@@ -16,44 +46,42 @@ export function histogramPart(panel) {
   let dragged = "";
   let last = null;
   let isSetUp = false;
-  const watchers = [];
-
-  const namesOn = (token) => cuts.filter((cut) => cut.token === token).flatMap((cut) => cut.names);
 
   function make(token) {
-    const bars = shape("svg", { class: "epypes-bars", viewBox: "0 0 1 1", preserveAspectRatio: "none", width: "100%", height: "100%" });
+    const bars = shape("svg", { viewBox: "0 0 1 1", preserveAspectRatio: "none", width: "100%", height: "100%" });
     const svg = shape("svg", { class: "epypes-histogram", "data-token": token, role: "group" }, bars);
-    const low = element("span", "epypes-low");
-    const high = element("span", "epypes-high");
-    const title = element("span", "epypes-histogram-of");
-    const foot = element("div", "epypes-axis", {}, low, title, high);
-    const figure = element("div", "epypes-chart", {}, svg, foot);
+    const [low, title, high] = [element("span"), element("span"), element("span")];
+    const figure = element("div", "epypes-chart", {}, svg, element("div", "epypes-axis", {}, low, title, high));
     root.append(figure);
     return { token, svg, bars, low, high, title, figure, lines: new Map(), histogram: null };
   }
 
-  function moveTo(chart, name, value, commit) {
+  function moveTo(chart, name, moved) {
     const found = panel.rowOf(name);
     if (!found) return;
     const { row, index } = found;
-    const next = clamped(row, index, value, row.names.map((one) => panel.state.values[one]));
+    const next = moved(row, index, row.names.map((one) => panel.state.values[one]));
     panel.state.values[name] = next;
     putLine(chart, name);
-    panel.set({ [name]: next }, commit);
+    panel.set({ [name]: next }, false);
   }
 
   function makeLine(chart, name, at) {
     const hit = shape("line", { y1: "0", y2: "100%", class: "epypes-cut-hit" });
     const line = shape("line", { y1: "0", y2: "100%", class: "epypes-cut-line" });
     const text = shape("text", { y: 13 + 14 * at, class: "epypes-cut-text" });
-    const group = shape("g", { class: "epypes-cut", role: "slider", tabindex: "0", "data-name": name, "aria-label": `${name} on the histogram of ${chart.token}` }, hit, line, text);
+    const label = `${name} on the histogram of ${chart.token}`;
+    const group = shape("g", { class: "epypes-cut", role: "slider", tabindex: "0", "data-name": name, "aria-label": label }, hit, line, text);
     follow(group, () => {
       const box = chart.svg.getBoundingClientRect();
       group.focus({ preventScroll: true });
       dragged = name;
       panel.hold([name]);
       return {
-        move: (event) => moveTo(chart, name, valueAt(chart.histogram, (event.clientX - box.left) / box.width), false),
+        move({ clientX }) {
+          const value = valueAt(chart.histogram, (clientX - box.left) / box.width);
+          moveTo(chart, name, (row, index, values) => clamped(row, index, value, values));
+        },
         end() {
           dragged = "";
           panel.set({ [name]: panel.state.values[name] }, true);
@@ -61,22 +89,16 @@ export function histogramPart(panel) {
         },
       };
     });
-    group.addEventListener("keydown", (event) => onKey(event, chart, name));
+    group.addEventListener("keydown", (event) => {
+      if (event.key === "Enter") panel.release([name]);
+      const count = LINE_KEYS[event.key] * (event.shiftKey ? FAST : 1);
+      if (!count) return;
+      consume(event);
+      moveTo(chart, name, (row, index, values) => stepped(row, index, values[index], count, values));
+    });
     group.addEventListener("blur", () => panel.commit());
     chart.svg.append(group);
     return { group, hit, line, text };
-  }
-
-  function onKey(event, chart, name) {
-    const steps = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
-    const found = panel.rowOf(name);
-    if (event.key === "Enter") panel.release([name]);
-    if (!steps || !found) return;
-    event.preventDefault();
-    event.stopPropagation();
-    const { row, index } = found;
-    const values = row.names.map((one) => panel.state.values[one]);
-    moveTo(chart, name, stepped(row, index, values[index], steps * (event.shiftKey ? FAST : 1), values), false);
   }
 
   function putLine(chart, name) {
@@ -84,47 +106,41 @@ export function histogramPart(panel) {
     const value = panel.state.values[name];
     if (!parts || typeof value !== "number") return;
     const share = shareOf(chart.histogram, value);
-    const x = `${(share * 100).toFixed(3)}%`;
-    for (const line of [parts.hit, parts.line]) {
-      note(line, "x1", x);
-      note(line, "x2", x);
-    }
+    const [x, isNearEnd] = [`${(share * 100).toFixed(3)}%`, share > NEAR_THE_END];
+    for (const line of [parts.hit, parts.line]) for (const end of ["x1", "x2"]) note(line, end, x);
     note(parts.text, "x", x);
-    note(parts.text, "dx", share > NEAR_THE_END ? "-5" : "5");
-    note(parts.text, "text-anchor", share > NEAR_THE_END ? "end" : "start");
+    note(parts.text, "dx", isNearEnd ? -5 : 5);
+    note(parts.text, "text-anchor", isNearEnd ? "end" : "start");
     say(parts.text, `${name} ${shortly(value)}`);
     const { row, index } = panel.rowOf(name) ?? {};
-    const range = row ? ends(row, index, []) : { low: chart.histogram.low, high: chart.histogram.high };
+    const { low, high } = row ? ends(row, index, []) : chart.histogram;
     note(parts.group, "aria-valuenow", written(value));
-    note(parts.group, "aria-valuemin", written(Number.isFinite(range.low) ? range.low : chart.histogram.low));
-    note(parts.group, "aria-valuemax", written(Number.isFinite(range.high) ? range.high : chart.histogram.high));
+    note(parts.group, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
+    note(parts.group, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
   }
 
   function paint(token, histogram) {
     if (!charts.has(token)) charts.set(token, make(token));
     const chart = charts.get(token);
+    const { low, high, channels, sampled } = histogram;
     chart.histogram = histogram;
-    chart.figure.hidden = false;
     const most = fullest(histogram);
-    while (chart.bars.children.length > histogram.channels.length) chart.bars.lastChild.remove();
-    histogram.channels.forEach((channel, i) => {
-      const path = chart.bars.children[i] ?? chart.bars.appendChild(shape("path"));
-      note(path, "class", `epypes-channel epypes-channel-${channel.name}`);
-      note(path, "d", outline(channel.counts, most, isLogarithmic));
-    });
-    say(chart.low, shortly(histogram.low));
-    say(chart.high, shortly(histogram.high));
-    const channels = histogram.channels.length > 1 ? ` ${histogram.channels.map((one) => one.name).join(" ")}` : "";
-    say(chart.title, `${token}${channels}${histogram.sampled ? ", sampled" : ""}${isLogarithmic ? ", log counts" : ""}`);
-    note(chart.svg, "aria-label", `Histogram of ${token} from ${shortly(histogram.low)} to ${shortly(histogram.high)}`);
-    lines(chart);
+    chart.bars.replaceChildren(
+      ...channels.map(({ name, counts }) => shape("path", { class: `epypes-channel epypes-channel-${name}`, d: outline(counts, most, isLogarithmic) })),
+    );
+    say(chart.low, shortly(low));
+    say(chart.high, shortly(high));
+    const names = channels.length > 1 ? ` ${channels.map((one) => one.name).join(" ")}` : "";
+    say(chart.title, `${token}${names}${sampled ? ", sampled" : ""}${isLogarithmic ? ", log counts" : ""}`);
+    note(chart.svg, "aria-label", `Histogram of ${token} from ${shortly(low)} to ${shortly(high)}`);
+    putLines(chart);
   }
 
-  function lines(chart) {
-    const names = namesOn(chart.token);
-    for (const [name, parts] of chart.lines) {
+  function putLines(chart) {
+    const names = cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
+    for (const [name, { group }] of chart.lines) {
       if (names.includes(name)) continue;
-      parts.group.remove();
+      group.remove();
       chart.lines.delete(name);
     }
     names.forEach((name, at) => {
@@ -133,26 +149,26 @@ export function histogramPart(panel) {
     });
   }
 
-  function show(frame) {
+  function show(frame = last) {
     last = frame;
-    if (!isOn) return;
+    if (!isOn || !frame) return;
     const wanted = new Map(Object.entries(frame.histograms ?? {}));
     if (frame.histogram) wanted.set(frame.token, frame.histogram);
-    for (const [token, chart] of charts) chart.figure.hidden = !wanted.has(token);
     for (const [token, histogram] of wanted) paint(token, histogram);
+    for (const [token, { figure }] of charts) figure.hidden = !wanted.has(token);
   }
 
   function switchTo(on) {
     isOn = on;
     root.hidden = !on;
-    for (const watcher of watchers) watcher();
+    panel.refresh();
   }
 
   return {
     element: root,
     setup(message) {
-      cuts = message.cuts ?? [];
-      for (const chart of charts.values()) lines(chart);
+      cuts = message.cuts;
+      for (const chart of charts.values()) putLines(chart);
       if (!isSetUp) switchTo(Boolean(message.histogram));
       else if (isOn && !message.histogram) panel.send({ kind: "histogram", on: true });
       isSetUp = true;
@@ -161,15 +177,14 @@ export function histogramPart(panel) {
     toggle() {
       switchTo(!isOn);
       panel.send({ kind: "histogram", on: isOn });
-      if (last) show(last);
+      show();
     },
     toggleLog() {
       isLogarithmic = !isLogarithmic;
-      if (last) show(last);
+      show();
     },
     get isOn() { return isOn; },
     get isLogarithmic() { return isLogarithmic; },
-    watch: (watcher) => watchers.push(watcher),
     isHeld: (name) => dragged === name,
   };
 }

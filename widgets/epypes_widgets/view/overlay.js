@@ -1,14 +1,22 @@
-// How are keypoints, contours and boxes drawn above a picture?
+// Keypoints, contours and boxes above a picture.
 import { note, shape } from "./elements.js";
 
 const LEAST_RADIUS = 2;
+/** Two strokes, dark under bright, can be seen on any picture. */
+const LAYERS = [
+  ["epypes-halo", "lines"],
+  ["epypes-halo epypes-dots", "dots"],
+  ["epypes-mark-line", "lines"],
+  ["epypes-mark-line epypes-dots", "dots"],
+];
 
-/** Return a point as a circle of its size with a hand that shows its angle; a dot for one without size. */
+/** Return a point as a circle of its size with a radius that shows its angle; a dot for one without size. */
 export function pointPath([x, y, size, angle]) {
   const at = (number) => Number(number.toFixed(2));
   if (!(size > 0)) return `M${at(x)} ${at(y)}h0`;
   const radius = Math.max(size / 2, LEAST_RADIUS);
-  const circle = `M${at(x - radius)} ${at(y)}a${at(radius)} ${at(radius)} 0 1 0 ${at(2 * radius)} 0a${at(radius)} ${at(radius)} 0 1 0 ${at(-2 * radius)} 0`;
+  const half = (along) => `a${at(radius)} ${at(radius)} 0 1 0 ${at(along)} 0`;
+  const circle = `M${at(x - radius)} ${at(y)}${half(2 * radius)}${half(-2 * radius)}`;
   if (!(angle >= 0)) return circle;
   const turned = (angle * Math.PI) / 180;
   return `${circle}M${at(x)} ${at(y)}l${at(radius * Math.cos(turned))} ${at(radius * Math.sin(turned))}`;
@@ -21,19 +29,14 @@ export function linePath(line, isClosed) {
   return path && isClosed ? `${path}Z` : path;
 }
 
-const LAYERS = [
-  ["epypes-halo", "lines"],
-  ["epypes-halo epypes-dots", "dots"],
-  ["epypes-mark-line", "lines"],
-  ["epypes-mark-line epypes-dots", "dots"],
-];
+/** Return a drawing above a picture. */
+export function overlaySvg() {
+  const layers = LAYERS.map(([name]) => shape("path", { class: name }));
+  return shape("svg", { class: "epypes-overlay", preserveAspectRatio: "none", "aria-hidden": "true" }, ...layers);
+}
 
 /** Draw marks, or take away those of the frame before. The first pixel of the picture reaches from 0 to 1. */
 export function drawOverlay(svg, overlay) {
-  if (!svg.firstChild) {
-    // Two strokes, dark under bright, can be seen on any picture.
-    for (const [name] of LAYERS) svg.append(shape("path", { class: name }));
-  }
   const points = overlay?.points ?? [];
   const lines = (overlay?.lines ?? []).map((line) => linePath(line, overlay.closed));
   const paths = {
@@ -47,6 +50,5 @@ export function drawOverlay(svg, overlay) {
 export function overlayCount(overlay) {
   if (!overlay) return "";
   const drawn = overlay.points.length + overlay.lines.length;
-  const of = drawn < overlay.total ? ` (${drawn} drawn)` : "";
-  return `${overlay.total} ${overlay.what}${of}`;
+  return `${overlay.total} ${overlay.what}${drawn < overlay.total ? ` (${drawn} drawn)` : ""}`;
 }

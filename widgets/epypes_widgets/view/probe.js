@@ -1,8 +1,19 @@
-// Which values has the pixel under the pointer, in every stage?
+// The values of the pixel under the pointer, in every stage.
 import { element, say } from "./elements.js";
-import { beside } from "./geometry.js";
 import { FAST } from "./numbers.js";
-import { oneAtATime } from "./protocol.js";
+import { questions } from "./protocol.js";
+
+const GAP_PX = 14;
+
+/** Return where a note of some size stands beside a point without leaving the room. */
+export function beside(point, note, room) {
+  const along = (at, length, space) => {
+    const after = at + GAP_PX;
+    const placed = after + length <= space ? after : at - GAP_PX - length;
+    return Math.max(0, Math.min(placed, space - length));
+  };
+  return { x: along(point.x, note.width, room.width), y: along(point.y, note.height, room.height) };
+}
 
 /** A small table beside the pointer, or beside a crosshair that is moved by keys. */
 export function probePart(panel, stage) {
@@ -16,12 +27,11 @@ export function probePart(panel, stage) {
   let point = null;
   let isOn = true;
   let isCrossed = false;
-  const questions = oneAtATime(({ x, y }, id) => panel.send({ kind: "probe", id, x, y }));
+  const asked = questions(({ x, y }, id) => (pixel ? panel.send({ kind: "probe", id, x, y }) : false));
 
   function hide() {
     note.hidden = true;
     pixel = null;
-    questions.forget();
   }
 
   function move() {
@@ -33,9 +43,10 @@ export function probePart(panel, stage) {
 
   function look(next, where) {
     point = where;
-    if (pixel && next.x === pixel.x && next.y === pixel.y) return move();
-    pixel = next;
-    questions.ask(pixel);
+    if (next.x !== pixel?.x || next.y !== pixel?.y) {
+      pixel = next;
+      asked.ask(pixel);
+    }
     move();
   }
 
@@ -44,52 +55,55 @@ export function probePart(panel, stage) {
     const at = stage.pointOf(event);
     const next = stage.pixelAt(at);
     if (!next) return hide();
-    const isSecond = event.currentTarget === stage.secondPane;
-    look(next, isSecond ? { x: at.x + stage.secondPane.offsetLeft, y: at.y } : at);
+    const left = event.currentTarget === stage.secondPane ? stage.secondPane.offsetLeft : 0;
+    look(next, { x: at.x + left, y: at.y });
   }
 
   function putCross() {
     cross.hidden = !isCrossed || !pixel;
     if (cross.hidden) return;
-    const at = stage.inBox(pixel);
-    cross.style.transform = `translate(${at.x}px, ${at.y}px)`;
-    point = at;
+    point = stage.inBox(pixel);
+    cross.style.transform = `translate(${point.x}px, ${point.y}px)`;
     move();
   }
 
-  function crossAt(next) {
+  function crossAt({ x, y }) {
     const { width, height } = stage.size;
-    const inside = { x: Math.max(0, Math.min(next.x, width - 1)), y: Math.max(0, Math.min(next.y, height - 1)) };
+    const inside = { x: Math.max(0, Math.min(x, width - 1)), y: Math.max(0, Math.min(y, height - 1)) };
     look(inside, stage.inBox(inside));
     putCross();
   }
 
-  function row(parts) {
-    const name = element("th", "", { scope: "row" }, parts.token);
-    const said = parts.state && parts.state !== "fresh" ? `${parts.text} (${parts.state})` : parts.text;
-    return element("tr", parts.token === panel.state.token ? "epypes-probe-here" : "", {}, name, element("td", "", {}, said));
+  function stopCross() {
+    isCrossed = false;
+    hide();
+    putCross();
+  }
+
+  function row({ token, text, state }) {
+    const value = state && state !== "fresh" ? `${text} (${state})` : text;
+    const name = element("th", "", { scope: "row" }, token);
+    return element("tr", token === panel.state.token ? "epypes-probe-here" : "", {}, name, element("td", "", {}, value));
   }
 
   for (const pane of [stage.pane, stage.secondPane]) {
     pane.addEventListener("pointermove", onMove);
-    pane.addEventListener("pointerleave", () => isCrossed || hide());
-    pane.addEventListener("pointerdown", () => isCrossed || hide());
+    for (const end of ["pointerleave", "pointerdown"]) pane.addEventListener(end, () => isCrossed || hide());
   }
   stage.watch(putCross);
 
   return {
-    message(answer) {
-      if (!questions.answer(answer.id) || !pixel) return;
-      if (answer.x !== pixel.x || answer.y !== pixel.y) return;
-      say(heading, `x ${answer.x}  y ${answer.y}`);
-      table.replaceChildren(...answer.rows.map(row));
+    message({ id, x, y, rows }) {
+      if (!asked.answer(id) || x !== pixel?.x || y !== pixel?.y) return;
+      say(heading, `x ${x}  y ${y}`);
+      table.replaceChildren(...rows.map(row));
       note.hidden = !isOn;
       move();
     },
     /** Other values are in the pixel now. */
     frame() {
       if (stage.canvas.hidden) hide();
-      else if (pixel && isOn) questions.ask(pixel);
+      else if (pixel && isOn) asked.ask(pixel);
       putCross();
     },
     toggle() {
@@ -99,24 +113,15 @@ export function probePart(panel, stage) {
     toggleCross() {
       if (isCrossed) return stopCross();
       isOn = isCrossed = true;
-      const { width, height } = stage.room;
-      const middle = stage.pixelAt({ x: width / 2, y: height / 2 });
-      crossAt(pixel ?? middle ?? { x: 0, y: 0 });
-      return undefined;
+      const middle = { x: stage.room.width / 2, y: stage.room.height / 2 };
+      return crossAt(pixel ?? stage.pixelAt(middle) ?? { x: 0, y: 0 });
     },
     moveCross(right, down, isFast) {
-      if (!isCrossed) return false;
       const step = isFast ? FAST : 1;
-      crossAt({ x: pixel.x + right * step, y: pixel.y + down * step });
-      return true;
+      if (isCrossed) crossAt({ x: pixel.x + right * step, y: pixel.y + down * step });
+      return isCrossed;
     },
     get isOn() { return isOn; },
     get isCrossed() { return isCrossed; },
   };
-
-  function stopCross() {
-    isCrossed = false;
-    hide();
-    putCross();
-  }
 }

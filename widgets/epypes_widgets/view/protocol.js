@@ -1,52 +1,11 @@
-// Which message counts, whatever the order they come in?
+// The messages of the view: which of them counts, and when values that were moved go to the kernel.
+import { same } from "./numbers.js";
 
-/**
- * What a view remembers of the numbers of its messages.
- *
- * A frame is shown if none newer has come; every frame is acknowledged once it is painted, or can't be.
- */
-export function arrivals() {
-  let received = 0;
-  let painted = 0;
-  let good = 0;
-  /** @type {null | {seq: number, text: string, function?: string, names?: string[]}} */
-  let failure = null;
-
-  return {
-    /** What is to be done with a frame: "show" it, "acknowledge" it, or "wait": it is being decoded already. */
-    frame(seq) {
-      if (seq <= painted || seq < received) return "acknowledge";
-      if (seq === received) return "wait";
-      received = seq;
-      return "show";
-    },
-    /** Whether a newer frame came while this one was decoded. */
-    isOvertaken: (seq) => seq < received,
-    /** Take down that a frame is on the screen; a later one may be already. */
-    paint(frame) {
-      painted = Math.max(painted, frame.seq);
-      if (frame.stale) return;
-      good = Math.max(good, frame.seq);
-      if (failure && failure.seq < good) failure = null;
-    },
-    /** Take down that a frame can't be shown; it may be sent again. */
-    lose(seq) {
-      if (received === seq) received = painted;
-    },
-    /** Whether an error says something new: neither a better frame nor a later error has come. An empty one ends it. */
-    fail(error) {
-      if (error.seq < good || (failure && error.seq < failure.seq)) return false;
-      failure = error.text ? error : null;
-      return true;
-    },
-    get failure() {
-      return failure;
-    },
-    get painted() {
-      return painted;
-    },
-  };
-}
+/** After that long an answer is taken for lost, and a value for refused by the kernel. */
+const LOST_MS = 1000;
+const REFUSED_MS = 3000;
+/** After that long without a picture the next moves go all the same: the graph is slow, or nothing is to be shown. */
+const PATIENCE_MS = 250;
 
 /** Lets through what is newest by its number; for messages that replace one another. */
 export function newestOnly() {
@@ -58,40 +17,134 @@ export function newestOnly() {
   };
 }
 
+/** Works on one thing at a time, the newest next. */
+export function newestNext(work) {
+  let isBusy = false;
+  let waiting = null;
+  return async (given) => {
+    if (isBusy) {
+      waiting = given;
+      return;
+    }
+    isBusy = true;
+    for (let next = given; next; [next, waiting] = [waiting, null]) await work(next);
+    isBusy = false;
+  };
+}
+
+/** Asks one question at a time, the newest next; an answer that does not come, or a question that is not asked, is not waited for. */
+export function questions(ask) {
+  let id = 0;
+  let answered = () => undefined;
+  const next = newestNext((question) => new Promise((resolve) => {
+    answered = resolve;
+    setTimeout(resolve, LOST_MS);
+    if (ask(question, ++id) === false) resolve();
+  }));
+  return {
+    ask: next,
+    /** Whether this answers the last question. */
+    answer(given) {
+      const isLast = given === id;
+      if (isLast) answered();
+      return isLast;
+    },
+  };
+}
+
 /**
- * Asks one question at a time, the latest next.
- * @param {(question: any, id: number) => void} ask
- * @param {number} [patience_ms] after which an answer is taken for lost
+ * While something is moved, what it was moved to goes out when the picture of the moves before is there, along with its
+ * acknowledgement: each message takes JupyterLab more time than the kernel takes to compute. The first goes at once, and
+ * so does what is committed.
+ * @param {(content: any) => void} send
+ * @param {(callback: () => void, delay_ms: number) => any} [later]
  * @param {() => number} [now_ms]
  */
-export function oneAtATime(ask, patience_ms = 1000, now_ms = () => performance.now()) {
-  let id = 0;
-  let asked_ms = -Infinity;
-  let isOpen = false;
-  let waiting = null;
+export function outbox(send, later = setTimeout, now_ms = () => performance.now()) {
+  /** Moved, and not yet sent: values by name, places of sliders by the id of their model. */
+  let values = {};
+  let places = {};
+  /** Sent, and not yet committed. */
+  let open = {};
+  /** Sent, and not yet seen in a frame: a frame that was computed before must not take the value back. */
+  const awaited = new Map();
+  let sent_ms = -Infinity;
+  let shown_ms = 0;
+  let isScheduled = false;
+  let isClosed = false;
 
-  function send(question) {
-    id += 1;
-    isOpen = true;
-    asked_ms = now_ms();
-    waiting = null;
-    ask(question, id);
+  const isEmpty = () => isClosed || !(Object.keys(values).length || Object.keys(places).length);
+
+  function taken() {
+    const moves = { values, places };
+    open = { ...open, ...values };
+    values = {};
+    places = {};
+    sent_ms = now_ms();
+    return moves;
+  }
+
+  function flush() {
+    if (!isEmpty()) send({ kind: "move", ...taken() });
+  }
+
+  function goOn() {
+    const wait_ms = sent_ms + PATIENCE_MS - now_ms();
+    if (wait_ms <= 0) flush();
+    else if (!isScheduled) {
+      isScheduled = true;
+      later(() => {
+        isScheduled = false;
+        if (!isEmpty()) goOn();
+      }, wait_ms);
+    }
   }
 
   return {
-    ask(question) {
-      if (isOpen && now_ms() - asked_ms < patience_ms) waiting = question;
-      else send(question);
+    set(given, commit) {
+      for (const [name, value] of Object.entries(given)) awaited.set(name, { value, at_ms: now_ms() });
+      values = { ...values, ...given };
+      if (!commit) return goOn();
+      send({ kind: "set", values });
+      for (const name of Object.keys(values)) delete open[name];
+      values = {};
     },
-    /** Whether this answers the last question; asks the one that waited. */
-    answer(answered) {
-      if (answered !== id) return false;
-      isOpen = false;
-      if (waiting) send(waiting);
+    /** A slider, by the id of its model, is being dragged, and is at this place. */
+    slide(model, place) {
+      places = { ...places, [model]: place };
+      goOn();
+    },
+    /** A frame has arrived, and the one before is on the screen, which took so long. */
+    painted(seq) {
+      sent_ms = -Infinity;
+      send({ kind: "painted", seq, ...(isEmpty() ? {} : { move: taken() }), ...(shown_ms ? { shown_ms } : {}) });
+    },
+    took(ms) {
+      shown_ms = ms;
+    },
+    /** Commit what was moved by keys. */
+    commit() {
+      const given = { ...open, ...values };
+      values = {};
+      open = {};
+      if (Object.keys(given).length) send({ kind: "set", values: given });
+    },
+    hold: (names) => send({ kind: "hold", names }),
+    release(names) {
+      flush();
+      send({ kind: "release", names });
+    },
+    /** Whether what a frame has of a value is newer than what was moved here. */
+    takes(name, value) {
+      const own = awaited.get(name);
+      if (own && !same(own.value, value) && now_ms() - own.at_ms < REFUSED_MS) return false;
+      awaited.delete(name);
       return true;
     },
-    forget() {
-      waiting = null;
+    /** Values are given by something else now, as an undo. */
+    forget: () => awaited.clear(),
+    close() {
+      isClosed = true;
     },
   };
 }

@@ -1,12 +1,47 @@
-// How is a rectangle drawn on the picture and given to a token?
-import { follow, note, shape } from "./elements.js";
+// Rectangles over the picture: drawn anew, moved, and resized by eight handles or by keys.
+import { consume, follow, note, shape } from "./elements.js";
 import { FAST } from "./numbers.js";
-import { HANDLES, between, isRectangle, resized, shifted, whole } from "./rectangles.js";
 
 const HANDLE_PX = 9;
+const HANDLES = ["nw", "n", "ne", "e", "se", "s", "sw", "w"];
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
-/** Rectangles over the picture: drawn anew, moved, and resized by eight handles or by keys. */
+/** @typedef {[number, number, number, number]} Rectangle x, y, width, height in whole pixels */
+
+/** Return all of a picture. */
+export const whole = (size) => [0, 0, size.width, size.height];
+
+/** Return the rectangle between two points, at least a pixel wide, within the picture. */
+export function between(one, other, size) {
+  const along = (a, b, length) => {
+    const from = Math.min(Math.max(Math.floor(Math.min(a, b)), 0), length - 1);
+    const to = Math.max(Math.min(Math.ceil(Math.max(a, b)), length), from + 1);
+    return [from, to - from];
+  };
+  const [x, width] = along(one.x, other.x, size.width);
+  const [y, height] = along(one.y, other.y, size.height);
+  return [x, y, width, height];
+}
+
+/** Return a rectangle moved by whole pixels; it stays as large as it is, and inside. */
+export function shifted([x, y, width, height], dx, dy, size) {
+  const along = (at, by, length, space) => Math.max(0, Math.min(Math.round(at + by), space - length));
+  return [along(x, dx, width, size.width), along(y, dy, height, size.height), width, height];
+}
+
+/** Return a rectangle with the sides that a handle stands for moved; sides that cross change places. */
+export function resized([x, y, width, height], handle, dx, dy, size) {
+  const by = (side, distance) => (handle.includes(side) ? distance : 0);
+  const rounded = (px, py) => ({ x: Math.round(px), y: Math.round(py) });
+  return between(rounded(x + by("w", dx), y + by("n", dy)), rounded(x + width + by("e", dx), y + height + by("s", dy)), size);
+}
+
+const isRectangle = (value) => Array.isArray(value) && value.length === 4 && value.every(Number.isFinite);
+
+function place(rect, [x, y, width, height]) {
+  for (const [key, value] of Object.entries({ x, y, width, height })) note(rect, key, value);
+}
+
 export function roiPart(panel, stage) {
   /** @type {Map<string, any>} by hyperparameter */
   const drawn = new Map();
@@ -14,81 +49,73 @@ export function roiPart(panel, stage) {
   let isDrawing = false;
   let dragged = "";
   const sizes = new Map();
-  const watchers = [];
 
-  const valueOf = (name) => {
-    const value = panel.state.values[name];
-    return isRectangle(value) ? value : whole(stage.size);
-  };
+  const valueOf = (name) => (isRectangle(panel.state.values[name]) ? panel.state.values[name] : whole(stage.size));
 
   /** Whether a rectangle in the pixels of one token means the same on the one that is shown. */
-  function fits(entry) {
+  function fits({ token, cuts_out }) {
     if (!panel.state.token || !stage.size.width || stage.canvas.hidden) return false;
-    const size = sizes.get(entry.token);
-    if (entry.token === panel.state.token) return true;
-    if (entry.cuts_out?.includes(panel.state.token)) return false;
-    return Boolean(size && size.width === stage.size.width && size.height === stage.size.height);
+    if (token === panel.state.token) return true;
+    const size = sizes.get(token);
+    return !cuts_out?.includes(panel.state.token) && size?.width === stage.size.width && size?.height === stage.size.height;
   }
 
-  const change = (name, value, commit) => {
+  function change(name, value, commit) {
     panel.state.values[name] = value;
     paint(name);
     panel.set({ [name]: value }, commit);
-  };
+  }
 
-  function dragOf(name, moved) {
+  /** Follow a drag on a node: `moved` returns the rectangle; Escape gives back the one before. */
+  function drag(event, name, moved) {
     const start = [...valueOf(name)];
-    return (event) => {
-      const from = stage.onPicture(stage.pointOf(event, stage.pane));
-      dragged = name;
-      panel.hold([name]);
-      let last = start;
-      return {
-        move(later) {
-          const to = stage.onPicture(stage.pointOf(later, stage.pane));
-          last = moved(start, from, to);
-          change(name, last, false);
-        },
-        end() {
-          dragged = "";
-          change(name, last, true);
-          panel.release([name]);
-        },
-      };
+    const at = (one) => stage.onPicture(stage.pointOf(one, stage.pane));
+    const [node, from] = [event.currentTarget, at(event)];
+    let last = start;
+    const cancel = (key) => {
+      if (key.key !== "Escape") return;
+      key.stopPropagation();
+      last = start;
+      node.releasePointerCapture(event.pointerId);
+    };
+    window.addEventListener("keydown", cancel, true);
+    dragged = name;
+    panel.hold([name]);
+    return {
+      move(later) {
+        last = moved(start, from, at(later));
+        change(name, last, false);
+      },
+      end() {
+        window.removeEventListener("keydown", cancel, true);
+        dragged = "";
+        change(name, last, true);
+        panel.release([name]);
+        setDrawing(false);
+        drawn.get(name).frame.focus({ preventScroll: true });
+      },
     };
   }
 
   function onKey(event, name) {
-    const value = valueOf(name);
-    const [dx, dy] = ARROWS[event.key] ?? [0, 0];
-    let next = null;
-    if (dx || dy) {
-      const step = event.altKey ? FAST : 1;
-      next = event.shiftKey
-        ? resized(value, "se", dx * step, dy * step, stage.size)
-        : shifted(value, dx * step, dy * step, stage.size);
-    } else if (event.key === "Delete" || event.key === "Backspace") next = whole(stage.size);
-    if (!next) return;
-    event.preventDefault();
-    event.stopPropagation();
-    change(name, next, event.key === "Delete" || event.key === "Backspace");
+    const [value, [dx, dy]] = [valueOf(name), ARROWS[event.key] ?? [0, 0]];
+    const isRemoved = event.key === "Delete" || event.key === "Backspace";
+    if (!dx && !dy && !isRemoved) return;
+    consume(event);
+    const step = event.altKey ? FAST : 1;
+    const moved = event.shiftKey ? resized(value, "se", dx * step, dy * step, stage.size) : shifted(value, dx * step, dy * step, stage.size);
+    change(name, isRemoved ? whole(stage.size) : moved, isRemoved);
   }
 
   function make(name) {
     const frame = shape("rect", { class: "epypes-roi-frame", tabindex: "0", role: "group", focusable: "true" });
     const shadow = shape("rect", { class: "epypes-roi-shadow" });
-    const handles = HANDLES.map((handle) => shape("rect", { class: "epypes-handle", "data-handle": handle }));
+    const handles = HANDLES.map((handle) => shape("rect", { class: "epypes-handle", "data-handle": handle, style: `cursor:${handle}-resize` }));
     const group = shape("g", { class: "epypes-roi-one", "data-name": name }, shadow, frame, ...handles);
-    follow(frame, (event) => {
-      frame.focus({ preventScroll: true });
-      return dragOf(name, (start, from, to) => shifted(start, to.x - from.x, to.y - from.y, stage.size))(event);
-    });
+    follow(frame, (event) => drag(event, name, (start, from, to) => shifted(start, to.x - from.x, to.y - from.y, stage.size)));
     for (const node of handles) {
-      follow(node, (event) => {
-        frame.focus({ preventScroll: true });
-        const moved = (start, from, to) => resized(start, node.dataset.handle, to.x - from.x, to.y - from.y, stage.size);
-        return dragOf(name, moved)(event);
-      });
+      const { handle } = node.dataset;
+      follow(node, (event) => drag(event, name, (start, from, to) => resized(start, handle, to.x - from.x, to.y - from.y, stage.size)));
     }
     frame.addEventListener("keydown", (event) => onKey(event, name));
     frame.addEventListener("blur", () => panel.commit());
@@ -97,23 +124,17 @@ export function roiPart(panel, stage) {
   }
 
   function paint(name) {
-    const parts = drawn.get(name);
+    const { group, frame, shadow, handles } = drawn.get(name);
     const [x, y, width, height] = valueOf(name);
-    const scale = stage.place.scale;
-    for (const rect of [parts.frame, parts.shadow]) {
-      for (const [key, value] of Object.entries({ x, y, width, height })) note(rect, key, String(value));
-    }
-    note(parts.frame, "aria-label", `${name}: ${width} by ${height} pixels at ${x}, ${y}. Arrows move it, with Shift they resize it, Delete takes the whole picture.`);
+    place(frame, [x, y, width, height]);
+    place(shadow, [x, y, width, height]);
+    note(frame, "aria-label", `${name}: ${width} by ${height} pixels at ${x}, ${y}. Arrows move it, with Shift they resize it, Delete takes the whole picture.`);
     // A rectangle that is all of the picture is not moved, so a drag inside it pans.
-    const isWhole = width === stage.size.width && height === stage.size.height;
-    parts.group.classList.toggle("epypes-roi-whole", isWhole);
-    const side = HANDLE_PX / scale;
-    for (const node of parts.handles) {
-      const handle = node.dataset.handle;
-      const along = handle.includes("w") ? 0 : handle.includes("e") ? width : width / 2;
-      const down = handle.includes("n") ? 0 : handle.includes("s") ? height : height / 2;
-      const at = { x: x + along - side / 2, y: y + down - side / 2, width: side, height: side };
-      for (const [key, value] of Object.entries(at)) note(node, key, String(value));
+    group.classList.toggle("epypes-roi-whole", width === stage.size.width && height === stage.size.height);
+    const side = HANDLE_PX / stage.place.scale;
+    for (const node of handles) {
+      const along = (low, high, length) => (node.dataset.handle.includes(low) ? 0 : node.dataset.handle.includes(high) ? length : length / 2);
+      place(node, [x + along("w", "e", width) - side / 2, y + along("n", "s", height) - side / 2, side, side]);
     }
   }
 
@@ -126,65 +147,26 @@ export function roiPart(panel, stage) {
   }
 
   function setDrawing(on) {
-    const entry = entries[0];
-    isDrawing = Boolean(on && entry);
-    if (isDrawing && !entries.some(fits)) panel.chooseStage(entry.token);
+    isDrawing = Boolean(on && entries.length);
+    if (isDrawing && !entries.some(fits)) panel.chooseStage(entries[0].token);
     stage.box.classList.toggle("epypes-drawing", isDrawing);
-    for (const watcher of watchers) watcher();
+    panel.refresh();
   }
 
-  // Before the press that would pan the picture.
-  stage.pane.addEventListener(
-    "pointerdown",
-    (event) => {
-      const entry = entries.find(fits);
-      if (!isDrawing || !entry || event.button !== 0) return;
-      event.preventDefault();
-      event.stopImmediatePropagation();
-      const name = entry.name;
-      const before = [...valueOf(name)];
-      const from = stage.onPicture(stage.pointOf(event));
-      let last = before;
-      dragged = name;
-      panel.hold([name]);
-      const move = (later) => {
-        last = between(from, stage.onPicture(stage.pointOf(later, stage.pane)), stage.size);
-        change(name, last, false);
-      };
-      const stop = (value) => {
-        stage.pane.removeEventListener("pointermove", move);
-        stage.pane.removeEventListener("pointerup", end);
-        window.removeEventListener("keydown", cancel, true);
-        dragged = "";
-        change(name, value, true);
-        panel.release([name]);
-        setDrawing(false);
-        drawn.get(name).frame.focus({ preventScroll: true });
-      };
-      const end = () => stop(last);
-      const cancel = (key) => {
-        if (key.key !== "Escape") return;
-        key.stopPropagation();
-        stop(before);
-      };
-      stage.pane.setPointerCapture(event.pointerId);
-      stage.pane.addEventListener("pointermove", move);
-      stage.pane.addEventListener("pointerup", end);
-      window.addEventListener("keydown", cancel, true);
-    },
-    { capture: true },
-  );
+  follow(stage.pane, (event) => {
+    const entry = isDrawing && entries.find(fits);
+    return entry && drag(event, entry.name, (_start, from, to) => between(from, to, stage.size));
+  });
   stage.watch(show);
 
   return {
     setup(message) {
-      const next = message.rois ?? [];
-      for (const [name, parts] of drawn) {
-        if (next.some((entry) => entry.name === name)) continue;
-        parts.group.remove();
+      entries = message.rois;
+      for (const [name, { group }] of drawn) {
+        if (entries.some((entry) => entry.name === name)) continue;
+        group.remove();
         drawn.delete(name);
       }
-      entries = next;
       for (const { name } of entries) if (!drawn.has(name)) drawn.set(name, make(name));
       show();
     },
@@ -194,7 +176,6 @@ export function roiPart(panel, stage) {
     },
     toggle: () => setDrawing(!isDrawing),
     stop: () => setDrawing(false),
-    watch: (watcher) => watchers.push(watcher),
     get isDrawing() { return isDrawing; },
     get exists() { return entries.length > 0; },
     isHeld: (name) => dragged === name,

@@ -1,19 +1,9 @@
-// What is added to the controls of the kernel's side: number boxes, resets, marks, folding and the filter?
-import { numberBox } from "./boxes.js";
-import { element, iconButton, note, say } from "./elements.js";
-import { inMs, same, shortly } from "./numbers.js";
-import { followSlides, shownAt } from "./slides.js";
+// What is added to the controls of ipywidgets: number boxes, resets, marks, folding and the filter.
+import { consume, element, iconButton, note, say, whenInside } from "./elements.js";
+import { numberBox } from "./number_box.js";
+import { inMs, modelValue, same, shortly, shownAt } from "./numbers.js";
 
 const NUMERIC = ["slider", "range", "log"];
-const RETRY_MS = 100;
-const RETRIES = 100;
-
-/** Return a row whose every field that is given by name is a list as long as its names. */
-export function perName(row) {
-  const each = (value) => (Array.isArray(value) && !(row.kind === "roi" && value.length === 4) ? value : row.names.map(() => value ?? null));
-  const fields = ["low", "high", "step", "default", "value"].map((field) => [field, each(row[field])]);
-  return { ...row, ...Object.fromEntries(fields) };
-}
 
 /** Decorates the rows of the panel that this view is in; they may come later than the view. */
 export function rowsPart(panel, figure) {
@@ -27,107 +17,77 @@ export function rowsPart(panel, figure) {
   const headings = new Map();
   let last = null;
   let failed = null;
-  const bound = new Set();
   const closing = new AbortController();
-  const seeker = new MutationObserver(() => seek());
-
-  const at = (css) => root.querySelector(`.${CSS.escape(css)}`);
   const until = { signal: closing.signal };
+  const seeker = new MutationObserver(seek);
 
-  function seekRoot(tries) {
-    root ??= figure.closest(".epypes-panel");
-    if (!root) {
-      if (tries > 0 && !closing.signal.aborted) setTimeout(() => seekRoot(tries - 1), RETRY_MS);
-      return;
-    }
-    listen();
-    seek();
-  }
-
-  function listen() {
-    if (root.dataset.epypesHeard) return;
-    root.dataset.epypesHeard = "yes";
+  const stopLooking = whenInside(figure, ".epypes-panel", (outer) => {
+    root = outer;
     root.addEventListener("pointerdown", onDown, { capture: true, ...until });
     root.addEventListener("keydown", onEnter, { capture: true, ...until });
     root.addEventListener("input", (event) => event.target.closest?.(".epypes-filter") && filter(), until);
-    root.addEventListener("focusin", (event) => nameHandles(event.target.closest?.(".epypes-row")), until);
-    closing.signal.addEventListener("abort", () => delete root.dataset.epypesHeard);
-    seeker.observe(root, { childList: true, subtree: true });
-  }
+    root.addEventListener("focusin", (event) => nameHandles(rowAt(event.target)), until);
+    seek();
+  });
 
   function seek() {
+    if (!root) return;
     for (const row of rows) if (!found.get(row)?.tail.isConnected) decorate(row);
     for (const folder of folders) if (!headings.get(folder)?.node.isConnected) decorateHeading(folder);
-    const isAll = rows.every((row) => found.has(row)) && folders.every((folder) => headings.has(folder));
-    if (isAll) seeker.disconnect();
+    if (found.size < rows.length || headings.size < folders.length) seeker.observe(root, { childList: true, subtree: true });
+    else seeker.disconnect();
   }
 
   function decorate(row) {
-    const node = at(row.css);
+    const node = root.querySelector(`.${row.css}`);
     if (!node) return;
     found.get(row)?.tail.remove();
     const boxes = NUMERIC.includes(row.kind) ? row.names.map((_, index) => numberBox(panel, row, index)) : [];
     const sign = element("span", "epypes-fault", { role: "img" });
-    const reset = iconButton("reset", `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`, () => onReset(row), "epypes-reset");
+    const label = `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`;
+    const reset = iconButton("reset", label, () => panel.send({ kind: "reset", names: row.names }), "epypes-reset");
     const tail = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
-    boxes.forEach((box, index) => tail.append(...(index ? ["–"] : []), box.input));
+    boxes.forEach(({ input }, index) => tail.append(...(index ? ["–"] : []), input));
     // Without a unit, too: the boxes stand below each other.
-    if (boxes.length || row.unit) tail.append(element("span", "epypes-unit", {}, row.unit ?? ""));
-    if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi(), "epypes-draw"));
+    if (boxes.length || row.unit) tail.append(element("span", "epypes-unit", {}, row.unit));
+    if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi()));
     if (row.kind !== "shown") tail.append(reset);
     tail.append(sign);
     note(node, "data-kind", row.kind);
-    if (row.tip && !node.title) node.title = row.tip;
     node.append(tail);
-    found.set(row, { node, tail, boxes, reset, sign, title: row.tip ?? "" });
-    nameHandles(node);
-    bind(row);
+    found.set(row, { node, tail, boxes, reset, sign });
+    nameHandles(row);
+    if (boxes.length) bind(row);
     markChanged(row);
     markFault(row);
   }
 
-  function onReset(row) {
-    panel.send({ kind: "reset", names: row.names });
-  }
-
   /** Sliders of the library have no names of their own. */
-  function nameHandles(node) {
-    const row = rows.find((one) => node && found.get(one)?.node === node);
-    if (!row) return;
-    node.querySelectorAll(".noUi-handle").forEach((handle, index) => note(handle, "aria-label", row.names[index] ?? row.names[0]));
+  function nameHandles(row) {
+    found.get(row)?.node.querySelectorAll(".noUi-handle").forEach((handle, index) => note(handle, "aria-label", row.names[index] ?? row.names[0]));
   }
 
   async function bind(row) {
-    if (!row.model || !NUMERIC.includes(row.kind)) return;
     const model = await panel.widgetModel(row.model);
     if (!model || closing.signal.aborted) return;
-    const told = () => moved(row, model.get("value"));
-    if (bound.has(row)) return told();
-    bound.add(row);
-    model.on("change:value", told);
-    closing.signal.addEventListener("abort", () => model.off("change:value", told));
-    told();
+    const update = () => moved(row, model.get("value"));
+    model.on("change:value", update);
+    closing.signal.addEventListener("abort", () => model.off("change:value", update));
+    update();
   }
 
   /** A slider has come to a place. */
   function moved(row, value) {
-    const each = Array.isArray(value) ? value : [value];
-    found.get(row)?.boxes.forEach((box, index) => box.moved(shownAt(row, each[index])));
+    found.get(row)?.boxes.forEach((box, index) => box.moved(shownAt(row, [value].flat()[index])));
     markChanged(row);
-  }
-
-  function valueOf(row, index) {
-    const box = found.get(row)?.boxes[index];
-    return box ? box.value : panel.state.values[row.names[index]];
   }
 
   function markChanged(row) {
     const parts = found.get(row);
     if (!parts) return;
-    const isChanged = row.names.some((_, index) => {
-      const value = valueOf(row, index);
-      const first = row.default[index];
-      return value !== undefined && first !== null && !same(value, first);
+    const isChanged = row.names.some((name, index) => {
+      const value = parts.boxes[index] ? parts.boxes[index].value : panel.state.values[name];
+      return value !== undefined && row.default[index] !== null && !same(value, row.default[index]);
     });
     parts.node.classList.toggle("epypes-changed", isChanged);
     parts.reset.disabled = !isChanged;
@@ -136,33 +96,26 @@ export function rowsPart(panel, figure) {
   function markFault(row) {
     const parts = found.get(row);
     if (!parts) return;
-    const isAtFault = Boolean(failed && row.names.some((name) => failed.names?.includes(name)));
+    const isAtFault = row.names.some((name) => failed?.names?.includes(name));
     parts.node.classList.toggle("epypes-failed", isAtFault);
     say(parts.sign, isAtFault ? "!" : "");
     if (isAtFault) note(parts.sign, "aria-label", failed.text);
-    const title = isAtFault ? failed.text : parts.title;
-    if (parts.node.title !== title) parts.node.title = title;
+    note(parts.node, "title", isAtFault ? failed.text : row.tip);
   }
 
   function decorateHeading(folder) {
-    const node = at(folder.css);
+    const node = root.querySelector(`.${folder.css}`);
     const heading = node?.querySelector(".epypes-heading");
     if (!heading?.querySelector(".epypes-name")) return;
     const sign = element("span", "epypes-fault epypes-heading-fault");
-    note(heading, "role", "button");
-    note(heading, "tabindex", "0");
-    note(heading, "aria-expanded", "true");
-    note(heading, "data-lm-suppress-shortcuts", "true");
+    const attributes = { role: "button", tabindex: "0", "aria-expanded": "true", "data-lm-suppress-shortcuts": "true" };
+    for (const [name, value] of Object.entries(attributes)) note(heading, name, value);
     heading.append(sign);
-    const fold = () => {
-      const isFolded = node.classList.toggle("epypes-folded");
-      note(heading, "aria-expanded", String(!isFolded));
-    };
+    const fold = () => note(heading, "aria-expanded", !node.classList.toggle("epypes-folded"));
     heading.addEventListener("click", fold, until);
     heading.addEventListener("keydown", (event) => {
       if (!["Enter", " "].includes(event.key)) return;
-      event.preventDefault();
-      event.stopPropagation();
+      consume(event);
       fold();
     }, until);
     headings.set(folder, { node, heading, sign });
@@ -177,17 +130,16 @@ export function rowsPart(panel, figure) {
     const isAtFault = failed?.function === folder.function;
     parts.heading.classList.toggle("epypes-failed", isAtFault);
     say(parts.sign, isAtFault ? "! failed" : "");
-    if (isAtFault) note(parts.heading, "title", failed.text);
-    else parts.heading.removeAttribute("title");
+    note(parts.heading, "title", isAtFault ? failed.text : "");
   }
 
   function filter() {
-    const asked = (root.querySelector(".epypes-filter input")?.value ?? "").trim().toLowerCase();
+    const asked = root.querySelector(".epypes-filter input").value.trim().toLowerCase();
     const words = asked.split(/\s+/).filter(Boolean);
     let matches = 0;
     for (const row of rows) {
-      const said = [...row.names, row.function, row.tip, row.unit].join(" ").toLowerCase();
-      const isMatch = words.every((word) => said.includes(word));
+      const text = [...row.names, row.function, row.tip, row.unit].join(" ").toLowerCase();
+      const isMatch = words.every((word) => text.includes(word));
       matches += Number(isMatch);
       found.get(row)?.node.classList.toggle("epypes-unmatched", !isMatch);
     }
@@ -200,23 +152,24 @@ export function rowsPart(panel, figure) {
 
   const rowAt = (node) => rows.find((row) => found.get(row)?.node === node?.closest?.(".epypes-row"));
 
+  /** A slider is pressed: what it passes on the way goes with the view's own messages; it reports its last place itself. */
   function onDown(event) {
     const target = event.target.closest?.(".noUi-target");
     const row = target && rowAt(target);
     if (!row || event.button !== 0) return;
-    const { names } = row;
-    panel.hold(names);
+    panel.hold(row.names);
     const over = new AbortController();
-    const slid = (value) => {
+    target.noUiSlider?.on("slide.epypes", (_texts, _handle, places) => {
+      const value = modelValue(row, places);
       moved(row, value);
       panel.slide(row.model, value);
-    };
-    followSlides(target, row, slid, over.signal);
+    });
     const release = (event) => {
-      // The element that had the focus loses it at this very press, which the window hears of, too.
+      // The element that had the focus loses it at this very press, which reaches the window, too.
       if (event.type === "blur" && event.target !== window) return;
       over.abort();
-      panel.release(names);
+      target.noUiSlider?.off("slide.epypes");
+      panel.release(row.names);
     };
     for (const end of ["pointerup", "pointercancel", "blur"]) window.addEventListener(end, release, { capture: true, signal: over.signal });
   }
@@ -235,22 +188,19 @@ export function rowsPart(panel, figure) {
 
   return {
     setup(message) {
-      const told = JSON.stringify([message.rows, message.folders]);
-      if (told !== given) {
-        given = told;
+      const next = JSON.stringify([message.rows, message.folders]);
+      if (next !== given) {
+        given = next;
         clear();
-        rows = message.rows.map(perName);
-        folders = message.folders;
+        ({ rows, folders } = message);
         for (const row of rows) row.names.forEach((name, index) => (panel.state.values[name] ??= row.value[index]));
       }
-      if (root) seeker.observe(root, { childList: true, subtree: true });
-      seekRoot(RETRIES);
+      seek();
     },
     frame({ frame }) {
       last = frame;
       for (const row of rows) {
-        const parts = found.get(row);
-        parts?.boxes.forEach((box) => box.name in frame.values && box.ran(frame.values[box.name]));
+        found.get(row)?.boxes.forEach((box) => box.name in frame.values && box.ran(frame.values[box.name]));
         markChanged(row);
       }
       folders.forEach(describe);
@@ -261,14 +211,12 @@ export function rowsPart(panel, figure) {
       folders.forEach(describe);
     },
     rowOf(name) {
-      for (const row of rows) {
-        const index = row.names.indexOf(name);
-        if (index >= 0) return { row, index };
-      }
-      return null;
+      const row = rows.find((one) => one.names.includes(name));
+      return row ? { row, index: row.names.indexOf(name) } : null;
     },
     close() {
       closing.abort();
+      stopLooking();
       seeker.disconnect();
       clear();
     },

@@ -1,20 +1,66 @@
-// What of the picture is in the box, and how is it moved about?
-import { element, shape } from "./elements.js";
-import { PIXELATED_SCALE, fitted, inBox, kept, onPicture, panned, pixelAt, zoomed } from "./geometry.js";
+// The box with the big picture: where the picture is in it, and which of its pixels is at a point.
+import { element, follow, shape } from "./elements.js";
+import { overlaySvg } from "./overlay.js";
 
+const MAX_SCALE = 64;
+/** From here on single pixels are looked at, so they are drawn as squares. */
+const PIXELATED_SCALE = 3;
+const MAX_FITTED_SCALE = 8;
 const WHEEL_STEP = 1.0015;
 const BUTTON_STEP = 1.5;
 const PAN_PX = 40;
-/** A hand that clicks moves a little. */
+/** A pointer that clicks moves a little. */
 const CLICK_PX = 3;
 
-/** The box with the big picture, the one that it is compared with, and the drawings above them. */
-export function stagePart(panel) {
-  const picture = element("img", "epypes-picture", { alt: "", hidden: "", draggable: "false" });
-  const other = element("img", "epypes-other", { alt: "", draggable: "false" });
-  const overlay = shape("svg", { class: "epypes-overlay", preserveAspectRatio: "none", "aria-hidden": "true" });
+/** @typedef {{width: number, height: number}} Size in pixels
+ *  @typedef {{scale: number, x: number, y: number}} Place box pixels per picture pixel, and the picture's corner */
+
+/** Return the place at which all of a picture is seen, in the middle. */
+export function fitted(size, room) {
+  const scale = Math.min(room.width / size.width, room.height / size.height, MAX_FITTED_SCALE) || 1;
+  return kept({ scale, x: 0, y: 0 }, size, room);
+}
+
+/** Return a place moved so that no room stays empty that the picture could fill. */
+export function kept(place, size, room) {
+  const along = (at, length, space) => (length <= space ? (space - length) / 2 : Math.min(0, Math.max(space - length, at)));
+  return {
+    scale: place.scale,
+    x: along(place.x, size.width * place.scale, room.width),
+    y: along(place.y, size.height * place.scale, room.height),
+  };
+}
+
+/** Return the place at another scale; what is at a point of the box stays there. */
+export function zoomed(place, scale, point, size, room) {
+  const next = Math.min(MAX_SCALE, Math.max(Math.min(fitted(size, room).scale, 1), scale));
+  const ratio = next / place.scale;
+  return kept({ scale: next, x: point.x - (point.x - place.x) * ratio, y: point.y - (point.y - place.y) * ratio }, size, room);
+}
+
+/** Return a point of the box in pixels of the picture, with fractions. */
+export function onPicture(place, point) {
+  return { x: (point.x - place.x) / place.scale, y: (point.y - place.y) / place.scale };
+}
+
+/** Return the pixel under a point of the box; null beside the picture. */
+export function pixelAt(place, point, size) {
+  const { x, y } = onPicture(place, point);
+  const inside = x >= 0 && y >= 0 && x < size.width && y < size.height;
+  return inside ? { x: Math.floor(x), y: Math.floor(y) } : null;
+}
+
+/** Return the middle of a pixel, in the box. */
+export function inBox(place, pixel) {
+  return { x: place.x + (pixel.x + 0.5) * place.scale, y: place.y + (pixel.y + 0.5) * place.scale };
+}
+
+/** The picture, the one that it is compared with, and the drawings above them. */
+export function stagePart() {
+  const picture = element("img", "epypes-picture", { alt: "", decoding: "sync", hidden: "", draggable: "false" });
+  const other = element("img", "epypes-other", { alt: "", decoding: "sync", draggable: "false" });
+  const [overlay, otherMarks] = [overlaySvg(), overlaySvg()];
   const roi = shape("svg", { class: "epypes-roi", preserveAspectRatio: "none" });
-  const otherMarks = shape("svg", { class: "epypes-overlay", preserveAspectRatio: "none", "aria-hidden": "true" });
   // Above the marks of the big picture: where it is seen, these are not.
   const layer = element("div", "epypes-layer", { hidden: "" }, other, otherMarks);
   const canvas = element("div", "epypes-canvas", {}, picture, overlay, layer, roi);
@@ -22,62 +68,33 @@ export function stagePart(panel) {
   const secondCanvas = element("div", "epypes-canvas");
   const secondPane = element("div", "epypes-pane epypes-second", { hidden: "" }, secondCanvas);
   const text = element("pre", "epypes-text", { hidden: "" });
-  const box = element(
-    "div",
-    "epypes-box",
-    { tabindex: "0", role: "group", "aria-label": "Picture. Plus and minus zoom, arrows pan, 0 fits, 1 shows pixel for pixel." },
-    pane,
-    secondPane,
-    text,
-  );
+  const label = "Picture. Plus and minus zoom, arrows pan, 0 fits, 1 shows pixel for pixel.";
+  const box = element("div", "epypes-box", { tabindex: "0", role: "group", "aria-label": label }, pane, secondPane, text);
   let place = { scale: 1, x: 0, y: 0 };
   let size = { width: 0, height: 0 };
   let room = { width: 0, height: 0 };
   let isFitted = true;
   const watchers = [];
 
-  function put() {
-    for (const one of [canvas, secondCanvas]) {
-      one.style.left = `${place.x}px`;
-      one.style.top = `${place.y}px`;
-      one.style.width = `${size.width * place.scale}px`;
-      one.style.height = `${size.height * place.scale}px`;
+  /** Put the picture at a place, if both its size and that of its room are known. */
+  function put(next, fits = false) {
+    if (!size.width || !room.width) return;
+    isFitted = fits;
+    place = next();
+    for (const { style } of [canvas, secondCanvas]) {
+      style.left = `${place.x}px`;
+      style.top = `${place.y}px`;
+      style.width = `${size.width * place.scale}px`;
+      style.height = `${size.height * place.scale}px`;
     }
     box.classList.toggle("epypes-pixelated", place.scale >= PIXELATED_SCALE);
     box.dataset.scale = String(place.scale);
     for (const watcher of watchers) watcher();
   }
 
-  const isKnown = () => size.width > 0 && room.width > 0;
-
-  function fit() {
-    isFitted = true;
-    if (!isKnown()) return;
-    place = fitted(size, room);
-    put();
-  }
-
-  function zoomTo(scale, point = { x: room.width / 2, y: room.height / 2 }) {
-    if (!isKnown()) return;
-    isFitted = false;
-    place = zoomed(place, scale, point, size, room);
-    put();
-  }
-
-  function panBy(dx, dy) {
-    if (!isKnown()) return;
-    isFitted = false;
-    place = panned(place, dx, dy, size, room);
-    put();
-  }
-
-  /** Take the size of the value shown; the place stays for one of the same size. */
-  function resize(width, height) {
-    if (width === size.width && height === size.height) return;
-    size = { width, height };
-    for (const svg of [overlay, otherMarks, roi]) svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    fit();
-  }
+  const fit = () => put(() => fitted(size, room), true);
+  const zoomTo = (scale, point = { x: room.width / 2, y: room.height / 2 }) => put(() => zoomed(place, scale, point, size, room));
+  const panBy = (dx, dy) => put(() => kept({ scale: place.scale, x: place.x + dx, y: place.y + dy }, size, room));
 
   /** The point of a pointer in whichever pane it is over. */
   function pointOf(event, over = event.currentTarget) {
@@ -86,61 +103,55 @@ export function stagePart(panel) {
   }
 
   function onWheel(event) {
-    const isArmed = box.contains(document.activeElement);
-    if (!isKnown() || !(event.ctrlKey || isArmed) || text.hidden === false) return;
+    const isArmed = event.ctrlKey || box.contains(document.activeElement);
+    if (!isArmed || !size.width || !text.hidden) return;
     event.preventDefault();
     event.stopPropagation();
     zoomTo(place.scale * WHEEL_STEP ** -event.deltaY, pointOf(event));
   }
 
   function onDown(event) {
-    if (event.button !== 0) return;
     box.focus({ preventScroll: true });
-    const over = event.currentTarget;
     let last = { x: event.clientX, y: event.clientY };
     let isPanning = false;
-    const move = (later) => {
-      const [dx, dy] = [later.clientX - last.x, later.clientY - last.y];
-      if (!isPanning && Math.hypot(dx, dy) < CLICK_PX) return;
-      isPanning = true;
-      box.classList.add("epypes-panning");
-      last = { x: later.clientX, y: later.clientY };
-      panBy(dx, dy);
+    return {
+      move(later) {
+        const [dx, dy] = [later.clientX - last.x, later.clientY - last.y];
+        if (!isPanning && Math.hypot(dx, dy) < CLICK_PX) return;
+        isPanning = true;
+        box.classList.add("epypes-panning");
+        last = { x: later.clientX, y: later.clientY };
+        panBy(dx, dy);
+      },
+      end: () => box.classList.remove("epypes-panning"),
     };
-    const end = () => {
-      over.removeEventListener("pointermove", move);
-      box.classList.remove("epypes-panning");
-    };
-    over.setPointerCapture(event.pointerId);
-    over.addEventListener("pointermove", move);
-    over.addEventListener("lostpointercapture", end, { once: true });
-    event.preventDefault();
-    event.stopPropagation();
   }
 
   for (const one of [pane, secondPane]) {
     one.addEventListener("wheel", onWheel, { passive: false });
-    one.addEventListener("pointerdown", onDown);
     one.addEventListener("dblclick", () => (isFitted ? zoomTo(1) : fit()));
   }
 
   // Its size is taken from here: to ask for it while a frame is shown would make the browser lay out the page.
-  const sizes = new ResizeObserver(([entry]) => {
-    const { width, height } = entry.contentRect;
+  const sizes = new ResizeObserver(([{ contentRect: { width, height } }]) => {
     if (!width || (width === room.width && height === room.height)) return;
     room = { width, height };
     if (isFitted) fit();
-    else if (isKnown()) {
-      place = kept(place, size, room);
-      put();
-    }
+    else put(() => kept(place, size, room));
   });
   sizes.observe(pane);
 
   return {
-    element: box, box, pane, secondPane, canvas, secondCanvas, picture, layer, other, otherMarks, overlay, roi, text,
-    fit, resize, pointOf,
-    zoomBy: (factor) => zoomTo(place.scale * factor),
+    element: box, box, pane, secondPane, canvas, secondCanvas, picture, layer, other, otherMarks, overlay, roi, text, fit, pointOf,
+    /** Begin to pan by drags; what is drawn by a drag on the picture comes before that. */
+    panByDrags: () => [pane, secondPane].forEach((one) => follow(one, onDown)),
+    /** Take the size of the value shown; the place stays for one of the same size. */
+    resize(width, height) {
+      if (width === size.width && height === size.height) return;
+      size = { width, height };
+      for (const svg of [overlay, otherMarks, roi]) svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+      fit();
+    },
     zoomIn: () => zoomTo(place.scale * BUTTON_STEP),
     zoomOut: () => zoomTo(place.scale / BUTTON_STEP),
     actualSize: () => zoomTo(1),
@@ -150,10 +161,10 @@ export function stagePart(panel) {
     onPicture: (point) => onPicture(place, point),
     inBox: (pixel) => inBox(place, pixel),
     /** Say in the place of the first picture what is waited for. */
-    wait(said) {
+    wait(message) {
       if (!picture.hidden || text.dataset.seq) return;
-      text.textContent = said;
-      text.hidden = !said;
+      text.textContent = message;
+      text.hidden = !message;
     },
     /** Call back whenever the picture has moved in its box. */
     watch: (watcher) => watchers.push(watcher),

@@ -1,83 +1,70 @@
-// Which small pictures stand below the big one: pinned stages, test images, and the past?
-import { element, note, say } from "./elements.js";
+// The small pictures below the big one: pinned stages, test images, and the history.
+import { element, fill, note, say, walkAlong } from "./elements.js";
 
-function thumbnail(label) {
-  return element("img", "epypes-thumbnail", { alt: label, draggable: "false" });
+const VERDICTS = { passed: "✓ pass", failed: "✗ fail", waiting: "… waits" };
+
+function strip(name, label) {
+  const root = element("div", `epypes-strip ${name}`, { role: "group", "aria-label": label });
+  walkAlong(root, "button");
+  return root;
 }
 
-function moveAlong(root) {
-  root.addEventListener("keydown", (event) => {
-    const all = [...root.querySelectorAll("button")];
-    const at = all.indexOf(document.activeElement);
-    const next = { ArrowLeft: at - 1, ArrowRight: at + 1, Home: 0, End: all.length - 1 }[event.key];
-    if (at < 0 || next === undefined) return;
-    event.preventDefault();
-    event.stopPropagation();
-    all[Math.max(0, Math.min(next, all.length - 1))]?.focus();
-  });
+/** A button with a small picture and a caption. */
+function small(attributes, press, ...caption) {
+  const img = element("img", "epypes-thumbnail", { alt: "", draggable: "false" });
+  const text = element("span", "epypes-small-text", { hidden: "" });
+  const button = element("button", "epypes-small", { type: "button", ...attributes }, img, text, element("span", "epypes-caption", {}, ...caption));
+  button.addEventListener("click", press);
+  return { img, text, button };
 }
 
-/** The stages that are kept in sight, each as a small picture that is clicked to be shown. */
+/** The stages that are kept in sight; a click shows one. */
 export function pinnedPart(panel) {
-  const root = element("div", "epypes-strip epypes-pinned", { role: "group", "aria-label": "Pinned stages", hidden: "" });
-  const shownBy = new Map();
-  moveAlong(root);
+  const root = strip("epypes-pinned", "Pinned stages");
+  const parts = new Map();
+  root.hidden = true;
 
   function make(token) {
-    const img = thumbnail(token);
-    const text = element("span", "epypes-small-text");
-    const button = element("button", "epypes-small", { type: "button", "data-token": token, title: `Show ${token}` }, img, text, element("span", "epypes-caption", {}, token));
-    button.addEventListener("click", () => panel.chooseStage(token));
-    root.append(button);
-    return { img, text, button };
+    const made = small({ "data-token": token, title: `Show ${token}` }, () => panel.chooseStage(token), token);
+    parts.set(token, made);
+    root.append(made.button);
   }
 
   return {
     element: root,
     frame({ frame, shown }) {
       const pinned = shown.filter(({ picture }) => picture.role === "pinned");
-      const tokens = new Set(pinned.map(({ picture }) => picture.token));
-      for (const [token, parts] of shownBy) {
-        if (tokens.has(token)) continue;
-        panel.blobs.drop([parts.img]);
-        parts.button.remove();
-        shownBy.delete(token);
+      for (const [token, { button }] of parts) {
+        if (pinned.some(({ picture }) => picture.token === token)) continue;
+        button.remove();
+        parts.delete(token);
       }
       for (const { picture, bytes } of pinned) {
-        if (!shownBy.has(picture.token)) shownBy.set(picture.token, make(picture.token));
-        const { img, text, button } = shownBy.get(picture.token);
-        const isText = picture.media_type === "text/plain";
-        img.hidden = isText;
-        text.hidden = !isText;
-        if (isText) say(text, picture.text ?? "");
-        else panel.blobs.fill(img, bytes, picture.media_type);
-        note(button, "aria-current", String(picture.token === frame.token));
+        if (!parts.has(picture.token)) make(picture.token);
+        const { img, text, button } = parts.get(picture.token);
+        text.hidden = Boolean(bytes);
+        img.hidden = !bytes;
+        say(text, picture.text ?? "");
+        fill(img, bytes, picture.media_type);
+        note(button, "aria-current", picture.token === frame.token);
       }
       root.hidden = pinned.length === 0;
     },
   };
 }
 
-const VERDICTS = { passed: "✓ pass", failed: "✗ fail", waiting: "… waits" };
-
-function tallied(verdicts) {
-  if (verdicts.some(({ state }) => state === "failed")) return "failed";
-  return verdicts.some(({ state }) => state === "waiting") ? "waiting" : "passed";
-}
-
 /** The test images that the graph can be tuned on. */
 export function filmsPart(panel) {
-  const root = element("div", "epypes-strip epypes-filmstrip", { role: "group", "aria-label": "Test images", hidden: "" });
+  const root = strip("epypes-filmstrip", "Test images");
   const tally = element("p", "epypes-tally", { role: "status", hidden: "" });
   let films = [];
   let verdicts = [];
-  moveAlong(root);
 
   function choose(chosen) {
-    for (const { index, button } of films) note(button, "aria-current", String(index === chosen));
+    for (const { index, button } of films) note(button, "aria-current", index === chosen);
   }
 
-  /** Said by sign and word, since not everybody tells their colours apart. */
+  /** By sign and text, since not everybody can tell their colours apart. */
   function judge() {
     for (const { index, title, button, badge } of films) {
       const verdict = verdicts[index];
@@ -85,10 +72,21 @@ export function filmsPart(panel) {
       if (!verdict) continue;
       note(badge, "data-state", verdict.state);
       say(badge, VERDICTS[verdict.state]);
-      const said = `${title}: ${verdict.state === "waiting" ? "" : `${verdict.state}, `}${verdict.text}`;
-      note(button, "title", said);
-      note(button, "aria-label", said);
+      const label = `${title}: ${verdict.state === "waiting" ? "" : `${verdict.state}, `}${verdict.text}`;
+      note(button, "title", label);
+      note(button, "aria-label", label);
     }
+  }
+
+  function make({ index, title }, bytes) {
+    const { img, button } = small({ title }, () => {
+      choose(index);
+      panel.send({ kind: "image", index });
+    }, title);
+    fill(img, bytes);
+    const badge = element("span", "epypes-verdict", { hidden: "" });
+    button.append(badge);
+    return { index, title, button, badge };
   }
 
   return {
@@ -97,28 +95,15 @@ export function filmsPart(panel) {
     cases(message) {
       verdicts = message.verdicts;
       say(tally, message.text);
-      note(tally, "data-state", tallied(verdicts));
+      note(tally, "data-state", ["failed", "waiting"].find((state) => verdicts.some((one) => one.state === state)) ?? "passed");
       tally.hidden = false;
       judge();
     },
-    setup(message, buffers) {
-      const images = message.images ?? [];
-      panel.blobs.drop(films.map(({ img }) => img));
-      films = images.map(({ index, title }, at) => {
-        const img = thumbnail(title);
-        panel.blobs.fill(img, buffers[at]);
-        const button = element("button", "epypes-small", { type: "button", title }, img, element("span", "epypes-caption", {}, title));
-        const badge = element("span", "epypes-verdict", { hidden: "" });
-        button.append(badge);
-        button.addEventListener("click", () => {
-          choose(index);
-          panel.send({ kind: "image", index });
-        });
-        return { index, title, button, img, badge };
-      });
+    setup({ images }, buffers) {
+      films = images.map((image, at) => make(image, buffers[at]));
       root.replaceChildren(...films.map(({ button }) => button));
-      judge();
       root.hidden = images.length === 0;
+      judge();
     },
     frame: ({ frame }) => choose(frame.image),
   };
@@ -126,51 +111,35 @@ export function filmsPart(panel) {
 
 /** The settings that were committed, oldest first. */
 export function historyPart(panel) {
-  const list = element("div", "epypes-strip epypes-entries");
-  const empty = element("span", "epypes-empty-strip", {}, "Nothing has been changed yet.");
-  const root = element("div", "epypes-history", { role: "group", "aria-label": "History" }, list);
+  const list = strip("epypes-entries", "History");
+  const root = element("div", "epypes-history", {}, list);
   /** By number of its entry; the kernel sends a thumbnail once. */
-  const images = new Map();
-  moveAlong(root);
+  let images = new Map();
 
   function make(entry, bytes) {
-    const img = images.get(entry.number) ?? thumbnail("");
-    const label = entry.label || `#${entry.number}`;
-    const said = entry.changed || "start";
-    const button = element(
-      "button",
-      "epypes-small epypes-entry",
-      { type: "button", "data-number": String(entry.number), "aria-label": `Go to ${label}: ${said}`, title: `${label}: ${said}`, "aria-current": String(Boolean(entry.current)) },
-      img,
-      element("span", "epypes-caption", {}, element("b", "", {}, label), ` ${said}`),
-    );
-    button.addEventListener("click", () => panel.send({ kind: "goto", number: entry.number }));
-    images.set(entry.number, img);
-    if (bytes?.byteLength) panel.blobs.fill(img, bytes);
-    img.hidden = !img.src;
-    return button;
-  }
-
-  function forget(entries) {
-    const numbers = new Set(entries.map(({ number }) => number));
-    for (const [number, img] of images) {
-      if (numbers.has(number)) continue;
-      panel.blobs.drop([img]);
-      images.delete(number);
-    }
+    const name = entry.label || `#${entry.number}`;
+    const text = entry.changed || "start";
+    const attributes = { "data-number": entry.number, "aria-label": `Go to ${name}: ${text}`, title: `${name}: ${text}`, "aria-current": Boolean(entry.current) };
+    const { img, button } = small(attributes, () => panel.send({ kind: "goto", number: entry.number }), element("b", "", {}, name), ` ${text}`);
+    const shown = images.get(entry.number) ?? img;
+    img.replaceWith(shown);
+    if (bytes?.byteLength) fill(shown, bytes);
+    shown.hidden = !shown.src;
+    button.classList.add("epypes-entry");
+    return [entry.number, shown, button];
   }
 
   return {
     element: root,
-    history(message, buffers) {
-      const { entries } = message;
+    history({ entries }, buffers) {
       const focused = document.activeElement?.closest?.(".epypes-entry")?.dataset.number;
-      const buttons = entries.map((entry, at) => make(entry, buffers[at]));
-      forget(entries);
-      list.replaceChildren(...(buttons.length ? buttons : [empty]));
-      if (focused !== undefined) buttons.find((one) => one.dataset.number === focused)?.focus();
+      const made = entries.map((entry, at) => make(entry, buffers[at]));
+      images = new Map(made);
+      const buttons = made.map(([, , button]) => button);
+      list.replaceChildren(...buttons);
+      buttons.find((one) => one.dataset.number === focused)?.focus();
       // Only this strip is scrolled, never the page.
-      const current = buttons.find((one) => one.getAttribute("aria-current") === "true");
+      const current = list.querySelector("[aria-current=true]");
       if (current) list.scrollLeft = current.offsetLeft - (list.clientWidth - current.offsetWidth) / 2;
     },
   };

@@ -1,0 +1,131 @@
+"""The test images of a panel: payloads that it can be switched to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any, Final
+
+from epypes.display import encode_image, is_image
+from epypes.errors import PayloadError, UnknownName
+from epypes.graph import colour_order
+from epypes.run.guard import is_array
+from epypes_widgets.target import Tunable
+
+_THUMBNAIL_PX: Final = 96
+_THUMBNAIL_BYTES: Final = 5_000
+_TITLE_CHARACTERS: Final = 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Payload:
+    """A payload to choose.
+
+    Attributes
+    ----------
+    title
+        What it is called: the name of its file, else its number.
+    values
+        By free source token, for ``runner.run(**values)``.
+    thumbnail
+        A picture of at most 96 x 96 pixels; empty if none of its values is an image.
+    """
+
+    title: str
+    values: Mapping[str, Any] = field(repr=False)
+    thumbnail: bytes = field(default=b"", repr=False)
+
+
+def payloads(runner: Tunable, images: Iterable[Any], titles: Sequence[str] = ()) -> tuple[Payload, ...]:
+    """Return what ``tune(runner, images=...)`` was given as payloads.
+
+    Parameters
+    ----------
+    runner
+        Its free source tokens are what a payload has values for.
+    images
+        Values of the one free source token, or mappings by token. A generator is read to its end.
+    titles
+        What they are called; without, their files say it, or their numbers.
+
+    Raises
+    ------
+    TypeError
+        Not a list, but a single image, mapping or name.
+    ValueError
+        There is none.
+    PayloadError
+        A free source token has no value, or a value is for a token that is not free.
+    UnknownName
+        A value is for no token of the graph.
+    """
+    given = _listed(images)
+    free = runner.free_source_tokens
+    values = [_values(runner, free, item, f"images[{place}]") for place, item in enumerate(given)]
+    return tuple(
+        Payload(titles[place] if titles else _title(payload, place), payload, _thumbnail(runner, payload))
+        for place, payload in enumerate(values)
+    )
+
+
+def is_alike(one: Any, other: Any) -> bool:
+    """Whether two images are one, or have the same pixels: a cell that is run again reads its files again."""
+    if one is other:
+        return True
+    if not (is_array(one) and is_array(other) and one.shape == other.shape and one.dtype == other.dtype):
+        return False
+    return bool((one == other).all())
+
+
+def _listed(images: Any) -> list[Any]:
+    if is_array(images) or isinstance(images, str | bytes | os.PathLike | Mapping) or not isinstance(images, Iterable):
+        kind = type(images).__name__
+        raise TypeError(f"images is a list of what the graph is to be tuned on, not a single {kind!r}: images=[...].")
+    listed = list(images)
+    if not listed:
+        raise ValueError("images is empty. Give at least one, or leave it out to tune on the last payload.")
+    return listed
+
+
+def _values(runner: Tunable, free: tuple[str, ...], item: Any, where: str) -> dict[str, Any]:
+    if not free:
+        raise PayloadError((), "The graph has no free source token to give images to. Leave images out.")
+    if not isinstance(item, Mapping):
+        if len(free) > 1:
+            text = f"{where} does not say which of {_named(free)} it is. Give mappings: {_call(free)}."
+            raise PayloadError(free, text)
+        return {free[0]: item}
+    for token in item:
+        if token not in runner.cg.tokens:
+            raise UnknownName("token", token, free)
+        if token not in free:
+            text = f"{where} has a value for {token!r}, which is not a free source token. Those are: {_named(free)}."
+            raise PayloadError((token,), text)
+    missing = tuple(token for token in free if token not in item)
+    if missing:
+        raise PayloadError(missing, f"{where} has no value for {_named(missing)}. Give all: {_call(free)}.")
+    return {token: item[token] for token in free}
+
+
+def _named(tokens: tuple[str, ...]) -> str:
+    return ", ".join(map(repr, tokens))
+
+
+def _call(tokens: tuple[str, ...]) -> str:
+    return f"images=[{{{', '.join(f'{token!r}: ...' for token in tokens)}}}, ...]"
+
+
+def _title(payload: Mapping[str, Any], place: int) -> str:
+    names = (value for value in payload.values() if isinstance(value, str | os.PathLike))
+    name = next((PurePath(os.fsdecode(name)).name for name in names), "")
+    return name[-_TITLE_CHARACTERS:] or f"{next(iter(payload))} {place + 1}"
+
+
+def _thumbnail(runner: Tunable, payload: Mapping[str, Any]) -> bytes:
+    token = next((token for token, value in payload.items() if is_image(value)), None)
+    if token is None:
+        return b""
+    order = colour_order(runner.cg, token)
+    return encode_image(payload[token], _THUMBNAIL_PX, order, most_bytes=_THUMBNAIL_BYTES).data

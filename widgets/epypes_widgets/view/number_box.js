@@ -1,0 +1,97 @@
+// A box beside a slider, in which a number is typed or stepped.
+import { element, note } from "./elements.js";
+import { FAST, means, read, same, stepped, written } from "./numbers.js";
+
+const NUMBER_KEYS = { ArrowUp: 1, ArrowDown: -1, PageUp: FAST, PageDown: -FAST };
+
+/**
+ * A number box for one value of a row. It shows where the slider is, and the exact value behind it at rest.
+ * What is being typed is never overwritten.
+ */
+export function numberBox(panel, row, index) {
+  const name = row.names[index];
+  const label = `${name}${row.unit ? ` in ${row.unit}` : ""}`;
+  const input = element("input", "epypes-number", { type: "number", step: "any", "aria-label": label, "data-name": name, title: row.tip });
+  let position = row.value[index];
+  let exact = position;
+  let isTyping = false;
+
+  const values = () => row.names.map((one) => panel.state.values[one]);
+  const current = () => (means(row, index, position, exact) ? exact : position);
+
+  function show() {
+    if (isTyping) return;
+    const text = typeof current() === "number" ? written(current()) : "";
+    if (input.value !== text) input.value = text;
+  }
+
+  function complain(problem) {
+    note(input, "aria-invalid", Boolean(problem));
+    input.title = problem || row.tip;
+    panel.tell(problem);
+  }
+
+  function restore() {
+    isTyping = false;
+    if (input.getAttribute("aria-invalid") === "true") complain("");
+    show();
+  }
+
+  function place(value, commit) {
+    restore();
+    position = exact = value;
+    panel.state.values[name] = value;
+    show();
+    panel.set({ [name]: value }, commit);
+  }
+
+  /** Take what was typed; it stays, marked, if it can't be taken. */
+  function commit() {
+    if (!isTyping) return;
+    const found = read(row, index, input.validity.badInput ? "what was typed" : input.value, values());
+    if ("problem" in found) complain(found.problem);
+    else place(found.value, true);
+  }
+
+  function onKey(event) {
+    const count = NUMBER_KEYS[event.key] * (event.shiftKey ? FAST : 1);
+    if (event.key === "Enter") {
+      if (isTyping) commit();
+      else panel.commit();
+      if (input.getAttribute("aria-invalid") !== "true") input.select();
+    } else if (event.key === "Escape") restore();
+    else if (count) {
+      event.preventDefault();
+      const typed = isTyping ? read(row, index, input.value, values()) : {};
+      place(stepped(row, index, "value" in typed ? typed.value : current(), count, values()), false);
+    } else return;
+    event.stopPropagation();
+  }
+
+  input.addEventListener("input", () => (isTyping = true));
+  input.addEventListener("change", commit);
+  input.addEventListener("blur", () => {
+    commit();
+    panel.commit();
+  });
+  input.addEventListener("wheel", (event) => document.activeElement === input && event.preventDefault(), { passive: false });
+  input.addEventListener("keydown", onKey);
+  show();
+
+  return {
+    input,
+    name,
+    /** The slider was moved, by the user or by the kernel. */
+    moved(value) {
+      if (same(value, position)) return;
+      position = value;
+      show();
+    },
+    /** A run with this value completed. */
+    ran(value) {
+      exact = value;
+      show();
+    },
+    get value() { return current(); },
+  };
+}
