@@ -94,10 +94,11 @@ def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[Bipart
 
 
 def _tokens(side: Any) -> tuple[str, ...]:
-    names = (side,) if isinstance(side, str) else side
-    if not isinstance(names, _SEQUENCES) or [name for name in names if not isinstance(name, str) or not name]:
+    if isinstance(side, str) and side:
+        return (side,)
+    if not isinstance(side, _SEQUENCES) or [name for name in side if not isinstance(name, str) or not name]:
         raise TypeError
-    return tuple(names)
+    return tuple(side)
 
 
 def find_problems(
