@@ -42,6 +42,7 @@ from epypes.bundle.references import cells_of, defaults_of, global_names, import
 from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
+from epypes.pipeline.node import wrap_calls
 from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
 from epypes.run.snapshot import Found, Record, Snapshot, array_record, as_dict, cached_properties, is_own, is_same
 
@@ -445,10 +446,7 @@ class MutableState:
         if not isinstance(function, Node):
             return self._guarded_call(name, function, snapshot)
         self._refer_to({key: node for key, node in snapshot.nodes.items() if node is not function})
-        if type(function).compute is Node.compute:
-            function.func = self._guarded_call(name, function.func, snapshot, function)
-        else:
-            function.compute = self._guarded_call(name, function.compute, snapshot, function)  # type: ignore[method-assign]
+        wrap_calls(function, lambda called: self._guarded_call(name, called, snapshot, function))
         return function
 
     def _refer_to(self, nodes: Mapping[int, Node]) -> None:

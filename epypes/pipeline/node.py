@@ -113,6 +113,14 @@ class Node:
         return f"<{type(self).__name__:.30} {self.name!r:.40}: {self.run_count} calls>"
 
 
+def wrap_calls(node: Node, wrap: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
+    """Have every call of a node go through ``wrap(function)``, also in runners that exist already."""
+    if type(node).compute is Node.compute:
+        node.func = wrap(node.func)
+    else:
+        node.compute = wrap(node.compute)  # type: ignore[method-assign]
+
+
 class NodeBasedCompGraph(CompGraph):
     """The network of Nodes of a graph: the same graph with a Node in place of each function.
 

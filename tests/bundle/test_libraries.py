@@ -207,6 +207,7 @@ def test_a_notebook_that_has_used_libraries_a_lot_is_promoted(monkeypatch, tmp_p
     import tempfile
 
     import matplotlib.pyplot as plt
+    import networkx
     import scipy.ndimage
     import scipy.stats
     from skimage import exposure, feature, filters, measure, segmentation
@@ -223,8 +224,9 @@ def test_a_notebook_that_has_used_libraries_a_lot_is_promoted(monkeypatch, tmp_p
     segmentation.slic(X, 5, channel_axis=None)
     exposure.equalize_adapthist(X)
     scipy.stats.norm.fit(X.ravel())
+    networkx.ancestors(networkx.DiGraph([(1, 2)]), 2)  # gets its code at its first call
     source = (
-        "import random, tempfile\nimport pandas as pd\nimport matplotlib.pyplot as plt\nimport scipy.ndimage, scipy.stats\n"
+        "import networkx, random, tempfile\nimport pandas as pd\nimport matplotlib.pyplot as plt\nimport scipy.ndimage, scipy.stats\n"
         "from skimage import filters, measure\n"
         "def use(x):\n    if x.mean() > 200:\n        return plt.figure(), tempfile.mkdtemp(), random.random()\n"
         "    labels = measure.label(x > filters.threshold_otsu(x))\n"

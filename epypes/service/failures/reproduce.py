@@ -19,6 +19,7 @@ import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -192,6 +193,8 @@ def _pipeline(folder: Path, scratch: Path) -> tuple[FullPipeline, list[Failure]]
 
 def _log_calls(pipeline: FullPipeline, file: Path) -> None:
     """Write the name of every function to a file before it is called: the file outlives the process."""
+    from epypes.pipeline.node import wrap_calls
+
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 
     def logged(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -203,7 +206,7 @@ def _log_calls(pipeline: FullPipeline, file: Path) -> None:
 
     pipeline.f_in, pipeline.f_out = logged("f_in", pipeline.f_in), logged("f_out", pipeline.f_out)
     for name, node in pipeline.network.nodes.items():
-        node.compute = logged(name, node.compute)  # type: ignore[method-assign]
+        wrap_calls(node, partial(logged, name))
 
 
 def _reproduction(failure: Failure, folder: Path) -> Reproduction:
