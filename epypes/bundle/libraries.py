@@ -39,6 +39,8 @@ _MOST_BYTES: Final = 65_536
 _OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
 # What these put into other modules, every notebook has.
 _OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
+# A name in modules that pytest has compiled otherwise, as it does with tests and plugins.
+_OF_PYTEST: Final = "@pytest_ar"
 _OWN: Final = ("__main__.", "unittest.mock.")
 _ALWAYS: Final = frozenset({"builtins", "numpy"})
 
@@ -164,7 +166,7 @@ def load_named(text: str) -> None:
 def attributes_of(modules: Iterable[str]) -> Attributes:
     """Return what modules hold by module and attribute, of those that are loaded."""
     loaded = {name: sys.modules[name] for name in modules if isinstance(sys.modules.get(name), types.ModuleType)}
-    return {name: dict(_attributes(module, name)) for name, module in loaded.items()}
+    return {name: dict(_attributes(module, name)) for name, module in loaded.items() if _OF_PYTEST not in vars(module)}
 
 
 def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[tuple[str, str], tuple[str, str]]:
@@ -244,6 +246,11 @@ def _text(value: Any) -> str:
     if isinstance(value, type):
         return f"{value.__module__}.{value.__qualname__}"
     if kind is types.FunctionType:
+        home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
+        wrapped = value.__dict__.get("__wrapped__")
+        if isinstance(wrapped, types.FunctionType):
+            # The wrapper of networkx gets its own code when it is first called.
+            return f"{home} {_text(wrapped)}"
         # Without objects such as sys.stdout; of functions the name, since they may refer to each other.
         given = [*enumerate(value.__defaults__ or ()), *sorted((value.__kwdefaults__ or {}).items())]
         defaults = [
@@ -251,7 +258,6 @@ def _text(value: Any) -> str:
             for key, default in given
             if callable(default) or isinstance(default, (*_ATOMS, tuple, frozenset))
         ]
-        home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
         return f"{home} {_code_text(value.__code__)} {_text(tuple(defaults))}"
     if inner := _INNER.get(kind) or (("_implementation",) if kind.__name__ == "_ArrayFunctionDispatcher" else ()):
         return f"{' '.join(_text(getattr(value, name)) for name in inner)} {kind.__name__}"
