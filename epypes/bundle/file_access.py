@@ -78,7 +78,7 @@ class FileAccess:
         own.discard(os.path.realpath(os.getcwd()))
         kept = [
             f"{what} reads {path}, which an earlier call has written: no answer may depend on an earlier event. "
-            "Make what it keeps a token (ep.delay)."
+            "Pass it in as a token."
             for path, what in self._kept.items()
             if not own & {path, *map(str, Path(path).parents)}
         ]
