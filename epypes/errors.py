@@ -36,11 +36,11 @@ Everything an error's text mentions is an attribute of it::
     +-- ExperimentError         the paper's experiment can't begin or go on; .name
     +-- ServiceError            a service can't start or can't be called; .path
     |   +-- RemoteFailure       a function failed in the service; .function, .message
-    |   +-- RevisionConflict    parameters were changed by somebody else meanwhile; .current
+    |   +-- RevisionConflict    another client has changed the parameters meanwhile; .current
     |   +-- ParametersRefused   a running service does not take new values; .problems
     |   +-- DeployRefused       a running service does not take a bundle; .reasons
     +-- ScaleError              a set of images or settings can't be run
-    |   +-- ExecutorBroken      whoever ran the jobs is gone; .done
+    |   +-- ExecutorBroken      the workers of an executor are gone; .done
     +-- StoreError              a database can't be opened, read or written; .place
     +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
@@ -418,7 +418,7 @@ class RemoteFailure(ServiceError):
 
 
 class RevisionConflict(ServiceError):
-    """Parameters of a service that somebody else has changed meanwhile; ``current`` is what they are now."""
+    """Parameters of a service that another client has changed meanwhile; ``current`` is what they are now."""
 
     def __init__(self, path: object, current: Parameters) -> None:
         self.current = current

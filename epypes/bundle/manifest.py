@@ -2,7 +2,7 @@
 
 The manifest can be checked by ``sha256sum --check MANIFEST.sha256``, which passes over its comments. They name what the
 samples were recorded with, so that a replay that differs can be explained. It is no signature: it shows accidents and
-careless changes, and anyone who can write the files can write the manifest anew.
+careless changes, and a program that can write the files can write the manifest anew.
 
 A bundle holds regular files only. A FIFO, a device or a link is refused before anything is read, since opening a FIFO
 blocks, a device has no end, and a link leads out of the folder.

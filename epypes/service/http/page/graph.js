@@ -34,7 +34,7 @@ export function redraw() {
   if (!isAsked && !document.hidden) void follow();
 }
 
-/** Draw when somebody looks, and look closer at what is chosen. */
+/** Draw while the page is visible, and show a chosen token larger. */
 export function watchGraph() {
   document.adoptedStyleSheets = [...document.adoptedStyleSheets, style];
   document.addEventListener("visibilitychange", () => isWanted && redraw());

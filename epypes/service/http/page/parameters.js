@@ -136,7 +136,7 @@ function mark(token) {
   field.box.classList.toggle("changed", isChanged);
   field.box.classList.remove("refused");
   if (!isChanged) delete field.note.dataset.meanwhile;
-  const meanwhile = field.note.dataset.meanwhile ? "changed by somebody else meanwhile, " : "";
+  const meanwhile = field.note.dataset.meanwhile ? "changed by another client meanwhile, " : "";
   field.note.textContent = isChanged ? `● ${meanwhile}${text(there)} in the service` : about(field.entry);
   showButtons();
 }
