@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 from weakref import ref
 
 from epypes.graph import CompGraph, Switch, as_switch
+from epypes.graph.signature import distinct
 from epypes.images import Contracts
 from epypes.run.guard import called_for, is_unguarded
 
@@ -111,8 +112,11 @@ class Program:
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
-        functions = {id(function): function for function in cg.functions.values() if not _is_alone(function)}
-        found = {key: objects for key, function in functions.items() if (objects := tuple(_with_revisions(function)))}
+        found = {
+            key: objects
+            for key, function in distinct(cg.functions).items()
+            if not _is_alone(function) and (objects := tuple(_with_revisions(function)))
+        }
         revised = [step for step in steps if id(cg.functions[step.name]) in found] if found else []
         self.revised = tuple(step.place for step in revised)
         self._with_revisions = tuple(found[id(cg.functions[step.name])] for step in revised)
