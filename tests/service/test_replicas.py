@@ -273,9 +273,11 @@ def paused(replicas):
     """Have replicas leave the events to others within the block."""
     for replica in replicas:
         replica.pause()
-    yield
-    for replica in replicas:
-        replica.resume()
+    try:
+        yield
+    finally:
+        for replica in replicas:
+            replica.resume()
 
 
 @pytest.mark.slow
