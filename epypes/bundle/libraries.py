@@ -231,10 +231,10 @@ def _described(value: Any) -> str:
         text = _text(value)
     except Exception:  # whatever an object raises that is made only to be imported
         return "unknown"
-    if len(text) <= _MOST_TEXT or isinstance(value, _ATOMS):
-        return text if len(text) <= _MOST_TEXT else _digest(text.encode("utf-8", "surrogatepass"))
-    head = text.partition(" ")[0]
-    return f"{head} {_digest(text.encode('utf-8', 'surrogatepass'))}"
+    if len(text) <= _MOST_TEXT:
+        return text
+    digest = _digest(text.encode("utf-8", "surrogatepass"))
+    return digest if isinstance(value, _ATOMS) else f"{text.partition(' ')[0]} {digest}"
 
 
 def _text(value: Any) -> str:

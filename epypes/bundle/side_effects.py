@@ -162,8 +162,8 @@ def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
 
-def check_patches(found: Definition, known: Patches) -> None:
-    """Refuse a definition that reads what the notebook has changed in a module or in a class of a library."""
+def check_reads(found: Definition, known: Patches) -> None:
+    """Refuse a definition that reads by reflection, or what the notebook has changed in a library's module or class."""
     names = {**sys.modules, **found.names, **_imported_by(found)}
     _check_reflection(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
@@ -225,8 +225,7 @@ def _is_patched(owner: Any, name: str) -> bool:
 def patches_in_notebook() -> Patches:
     """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
     names, found = vars(sys.modules["__main__"]), dict[tuple[Any, str], str]()
-    script = str(names.get("__file__") or "")
-    for cell, text in executed_cells(names, script):
+    for cell, text in _cells():
         for written in _written_in(text):
             node = written
             while isinstance(node, ast.Attribute | ast.Subscript):
@@ -234,11 +233,17 @@ def patches_in_notebook() -> Patches:
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
                 is_of_library |= isinstance(owner, types.ModuleType)
                 if isinstance(node, ast.Attribute) and node.attr and is_of_library:
-                    place = f"cell [{cell}]" if cell else script
-                    found[owner, node.attr] = f"{place}, line {written.lineno}"
+                    found[owner, node.attr] = f"{cell}, line {written.lineno}"
                     break
                 node = node.value
     return found
+
+
+def _cells() -> Iterator[tuple[str, str]]:
+    """Give the text of each cell that was executed, or of the script, after its name in a place."""
+    names = vars(sys.modules["__main__"])
+    script = str(names.get("__file__") or "")
+    return ((f"cell [{cell}]" if cell else script, text) for cell, text in executed_cells(names, script))
 
 
 @lru_cache(maxsize=512)  # every function of a graph asks for every cell
@@ -265,15 +270,14 @@ def place_of_change(name: str, *, is_call: bool = False) -> str:
     That is an assignment to it, or a text or keyword that names it; or a call of it if ``is_call``.
     """
     last, found = name.rpartition(".")[2], ""
-    script = str(vars(sys.modules["__main__"]).get("__file__") or "")
-    for cell, text in executed_cells(vars(sys.modules["__main__"]), script):
+    for cell, text in _cells():
         tree = parsed(text)
         nodes: list[Any] = [*ast.walk(tree)] if tree else []
         read = {id(node.slice) for node in nodes if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)}
         calls = (node for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "getattr")
         read |= {id(argument) for call in calls for argument in call.args}
         lines = [node.lineno for node in nodes if id(node) not in read and _may_change(node, last, is_call=is_call)]
-        found = f"{f'cell [{cell}]' if cell else script}, line {lines[-1]}" if lines else found
+        found = f"{cell}, line {lines[-1]}" if lines else found
     return found
 
 

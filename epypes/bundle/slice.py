@@ -58,7 +58,7 @@ from epypes.bundle.side_effects import (
     CHANGING,
     check_home,
     check_notebook_name,
-    check_patches,
+    check_reads,
     check_state,
     patches_in_notebook,
 )
@@ -342,7 +342,7 @@ class Slice:
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
         """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
-        check_patches(found, self._patches)
+        check_reads(found, self._patches)
         read = found.reads()
         self.reads[name] = frozenset(read) - {*own}
         for needed in read:
