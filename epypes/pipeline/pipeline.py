@@ -13,8 +13,8 @@ from epypes.errors import HyperparameterError, PayloadError
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
 from epypes.pipeline.node import Node, NodeBasedCompGraph
-from epypes.rich_display import mimebundle
 from epypes.run import CompGraphRunner, Run
+from epypes.run.result import TokenMapping
 from epypes.wording import counted
 
 StageKind = Literal["queue", "loop", "function"]
@@ -52,7 +52,7 @@ class Stages:
     after: tuple[Stage, ...] = ()
 
 
-class Pipeline(Node, Mapping[str, Any]):
+class Pipeline(Node, TokenMapping):
     """A Node that runs a graph; a mapping of its runner's tokens, as a CompGraphRunner is.
 
     Called with the free source tokens in order of first appearance in func_io, it returns its sink token, or a
@@ -181,12 +181,6 @@ class Pipeline(Node, Mapping[str, Any]):
         """Whether there is a pipeline: true also before its first run, as of any other function."""
         return True
 
-    # Values may be arrays, and a pipeline changes: pipelines are told apart by identity.
-    __hash__ = object.__hash__
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
     def __setitem__(self, token: str, value: Any) -> None:
         self.runner[token] = value
 
@@ -247,9 +241,6 @@ class Pipeline(Node, Mapping[str, Any]):
             return self.network.nodes
         # Of a rerun, which counts as no call, the times of what was reused are still those of the call.
         return [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return mimebundle(self)
 
 
 def _allows(hint: Param | Roi, value: Any) -> bool:

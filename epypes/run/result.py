@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph import CompGraph, redefined
+from epypes.rich_display import mimebundle
 from epypes.run.failure import Failure
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.hyperparameters import Hyperparameters
@@ -29,7 +30,23 @@ Record = tuple[list[Any], bytes, bool, tuple[Any, ...], Hyperparameters, Times, 
 TrialOf = tuple[object, Hyperparameters, "ref[Run] | None"]
 
 
-class Run(Mapping[str, Any]):
+class TokenMapping(Mapping[str, Any]):
+    """What is read by token and shows itself; compared by identity, since values may be arrays."""
+
+    __slots__ = ()
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        return mimebundle(self)
+
+
+class Run(TokenMapping):
     """A run that has ended: a mapping from tokens to values, which does not change any more.
 
     Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
@@ -109,25 +126,11 @@ class Run(Mapping[str, Any]):
         tokens = self.tokens
         return (token for token in self.cg.tokens if tokens.is_readable(token))
 
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-    # Values may be arrays, so runs are told apart by identity.
-    __hash__ = object.__hash__
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
     def __repr__(self) -> str:
         state = f"failed in {self.failure.function!r:.30}" if self.failure else "completed"
         redefinitions = len(redefined(self.cg))
         old = f"; {counted(redefinitions, 'function')} redefined" * bool(redefinitions)
         return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.rich_display import mimebundle
-
-        return mimebundle(self)
 
 
 class RunImporter:

@@ -12,14 +12,13 @@ from weakref import ref
 
 from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
-from epypes.rich_display import mimebundle
 from epypes.run.execute import CompiledRun, Executor
 from epypes.run.failure import failure_of
 from epypes.run.guard import COPIERS, lend, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
-from epypes.run.result import Run, TrialOf, new_run
+from epypes.run.result import Run, TokenMapping, TrialOf, new_run
 from epypes.run.staleness import TokenManager
 from epypes.run.timing import Reports
 from epypes.wording import counted
@@ -30,7 +29,7 @@ _LOG: Final = logging.getLogger(__name__)
 _MAX_TARGETS: Final = 64
 
 
-class CompGraphRunner(Mapping[str, Any]):
+class CompGraphRunner(TokenMapping):
     """Runs a graph; a mapping of its tokens that can be read now.
 
     These are the hyperparameters, and what the last run has left that is not stale, in graph order. Reading any other
@@ -532,15 +531,6 @@ class CompGraphRunner(Mapping[str, Any]):
         now, frozen = self._tokens_now(hparams, last), hparams.entries
         return iter([token for token in self.cg.tokens if token in frozen or now.is_readable(token)])
 
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-    # Values may be arrays, and a runner changes: runners are told apart by identity.
-    __hash__ = object.__hash__
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
     def __repr__(self) -> str:
         last, redefinitions = self.last, len(redefined(self.cg))
         old = f" ({redefinitions} redefined)" * bool(redefinitions)
@@ -552,9 +542,6 @@ class CompGraphRunner(Mapping[str, Any]):
             state = f"{counted(len(self.stale), 'function')} stale" if self.stale else "up to date"
         functions, frozen = counted(len(self.cg.functions), "function"), len(self.hyperparameters)
         return f"<CompGraphRunner: {functions}{old}, {counted(frozen, 'hyperparameter')}; {state}>"
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return mimebundle(self)
 
 
 def branched(runner: CompGraphRunner) -> CompGraphRunner:

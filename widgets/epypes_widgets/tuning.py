@@ -1,7 +1,7 @@
 """From a value that is set to its picture on the screen, and to the history.
 
 A value that is set is wanted from then on (``session``), and the worker gets a request. It tries what is wanted, shows
-what comes out, and commits it to the history when the values have come to rest.
+the result, and commits it to the history when the values have stayed the same for a moment.
 """
 
 from __future__ import annotations
