@@ -192,7 +192,8 @@ def test_files_of_others_are_left_alone_and_damaged_ones_are_counted_and_told(tm
     wrong = [{"id": good.id}, {"attempt": "1"}, {"tokens": "image"}, {"hyperparameters": []}, {"id": "../../etc"}]
     bad = [b"", b"{", b"[" * 100_000, b"null"]
     bad += [json.dumps(asdict(FAILED) | each).encode() for each in wrong]
-    names = [good.id[:-2] + f"{number:02}" for number in range(len(bad))]
+    others = (good.id[:-2] + f"{number:02}" for number in range(len(bad) + 1))
+    names = [name for name in others if name != good.id][: len(bad)]
     for name, text in zip(names, bad, strict=True):
         (tmp_path / f"{name}.failure").write_bytes(text)
     assert [record.id for record in store.records()] == [good.id]
