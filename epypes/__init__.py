@@ -2,6 +2,7 @@
 
 The rooms, from the bottom up; imports point downwards only (checked by ``lint-imports``):
 
+- ``deprecation``: how names of EPypes 0.1 answer; ``compat``, above all other rooms: the table of them
 - ``errors``: every error EPypes raises; ``optional``: which extra brings a package that is missing;
   ``rich_display``: the registry that objects ask for their picture
 - ``annotations``: what a function's annotations say, once evaluated
@@ -21,6 +22,7 @@ Names are loaded when they are first used, so ``import epypes`` costs little and
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
         SourcePipeline,
         Stage,
         Stages,
+        wait,
     )
     from epypes.run import (
         CompGraphRunner,
@@ -110,6 +113,7 @@ _HOMES = {
     "SourcePipeline": "epypes.pipeline",
     "Stage": "epypes.pipeline",
     "Stages": "epypes.pipeline",
+    "wait": "epypes.pipeline",
     "Store": "epypes.store",
     "Publisher": "epypes.transport",
     "Subscriber": "epypes.transport",
@@ -192,6 +196,7 @@ __all__ = [
     "unguarded",
     "union",
     "verify",
+    "wait",
 ]
 
 
@@ -211,3 +216,18 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+class _OldModules:
+    """Finds the modules of EPypes 0.1 that are gone, after all others have found none of that name."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> Any:
+        if not name.startswith("epypes.") or name == "epypes.compat":
+            return None
+        return importlib.import_module("epypes.compat").find_spec(name)
+
+
+# Also when epypes is imported again by importlib.reload.
+if not any(getattr(finder, "__qualname__", "") == _OldModules.__qualname__ for finder in sys.meta_path):
+    sys.meta_path.append(_OldModules)

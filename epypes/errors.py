@@ -54,6 +54,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from epypes.deprecation import OldNames
+
 if TYPE_CHECKING:
     from epypes.bundle.replay import ReplayReport
     from epypes.images import Image
@@ -141,7 +143,7 @@ def run_call(tokens: Iterable[str]) -> str:
     return f"run({', '.join(f'{token}=...' for token in tokens)})"
 
 
-class PayloadError(EpypesError, TypeError):
+class PayloadError(OldNames, EpypesError, TypeError):
     """``run()`` was called with missing or with wrong tokens; ``tokens`` names them."""
 
     def __init__(self, tokens: Iterable[str], text: str) -> None:

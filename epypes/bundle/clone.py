@@ -45,7 +45,7 @@ def _clone(function: Any) -> Any:
         return inner
     hyperparameters = inner.runner.hyperparameters
     cg = _frozen(clone_graph(inner.source_cg), hyperparameters)
-    return Pipeline(inner.name, cg, hyperparameters, workers=inner.runner.workers)
+    return Pipeline(inner.name, cg, hyperparameters, workers=inner.runner.workers, guard=inner.runner.guard)
 
 
 def clone_runner(runner: CompGraphRunner, hyperparameters: Mapping[str, Any] | None = None) -> CompGraphRunner:
@@ -85,7 +85,8 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
     held = dict(vars(made))
     if isinstance(made, Pipeline):
         runner = made.runner
-        held |= {"cg": made.source_cg, "hparams": dict(runner.hyperparameters) or None, "workers": runner.workers}
+        held |= {"cg": made.source_cg, "hparams": dict(runner.hyperparameters) or None}
+        held |= {"workers": runner.workers, "guard": runner.guard}
     found: dict[str, Any] = {}
     for parameter in parameters_of(type(made)):
         value = as_written(held.get(parameter.name, held.get(f"_{parameter.name}", parameter.default)))

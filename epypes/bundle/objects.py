@@ -269,6 +269,7 @@ def _runner(runner: CompGraphRunner) -> Description:
 def _graph_parts(value: Any) -> list[tuple[str, Any]]:
     runner = value.runner if isinstance(value, Pipeline) else value
     parts: list[tuple[str, Any]] = [(" graph", getattr(value, "source_cg", runner.cg)), (" workers", runner.workers)]
+    parts.append((" guard", runner.guard))
     return parts + [(f" hyperparameter {token!r}", given) for token, given in runner.hyperparameters.items()]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
 from typing import Any, Final
@@ -27,6 +28,7 @@ from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, Switch, as_switch
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
+from epypes.run.guard import in_out_places
 
 # A longer default of a parameter is a constant above the function.
 _LONGEST: Final = 60
@@ -84,8 +86,8 @@ def to_source(
     Notes
     -----
     What a runner does around functions is not written: arrays are passed as they are, not as read-only views, and
-    annotations are not compared with values. A function that several branches of a switch need is called before the
-    switch, whichever is chosen.
+    annotations are not compared with values. A function of OpenCV that writes into an input gets a copy of it, as in a
+    run. A function that several branches of a switch need is called before the switch, whichever is chosen.
 
     Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, name code generation as further work.
 
@@ -227,6 +229,10 @@ class _Function:
         By switch and token, the expressions of the values that choose it.
     calls
         By function, the expression that refers to it.
+    copied
+        By function, the places of the inputs into which it writes, so that it is given copies.
+    copy
+        The expression that refers to what copies them; empty if there are none.
     defaults
         By hyperparameter, the expression of its value.
     variables
@@ -245,6 +251,11 @@ class _Function:
         switches = {each: as_switch(cg.functions[each]) for each in self.regions}
         self.switches = {each: self._keys(each, switch) for each, switch in switches.items() if switch is not None}
         self.calls = {each: self._call(each) for each in self.regions if each not in self.switches}
+        copied = {
+            each: in_out_places(without_nodes(cg.functions[each]), len(cg.func_inputs(each))) for each in self.calls
+        }
+        self.copied = {each: places for each, places in copied.items() if places}
+        self.copy = module.expression("The copy of an input", copy.deepcopy, _NO_EXPRESSION) if self.copied else ""
         self.defaults = {token: self._default(token, value) for token, value in values.items() if token in tokens}
         self.variables = self._named(tokens)
         module.texts.append(self._text())
@@ -295,7 +306,8 @@ class _Function:
     def _named(self, tokens: Iterable[str]) -> dict[str, str]:
         """Return a variable for each token that hides nothing of the module; names that can stay come first."""
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
-        taken = {name for source in {*self.calls.values(), *keys} for name in names_in(source)} | {"ValueError"}
+        sources = {*self.calls.values(), *keys, *filter(None, [self.copy])}
+        taken = {name for source in sources for name in names_in(source)} | {"ValueError"}
         found: dict[str, str] = {}
         for token in sorted(tokens, key=lambda token: not is_identifier(token) or token in taken):
             found[token] = identifier_of(token, taken.__contains__)
@@ -308,8 +320,10 @@ class _Function:
             if name in self.switches:
                 yield from self._switch(name, region)
             else:
-                arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
-                yield from laid_out(f"{self.calls[name]}({arguments})", len(region) + 1, self._targets(name))
+                arguments = [self.variables[token] for token in self.cg.func_inputs(name)]
+                for place in self.copied.get(name, ()):
+                    arguments[place] = f"{self.copy}({arguments[place]})"
+                yield from laid_out(f"{self.calls[name]}({', '.join(arguments)})", len(region) + 1, self._targets(name))
 
     def _targets(self, name: str) -> str:
         """Return what stands before the value of a function."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import inspect
 import linecache
-import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,12 +18,11 @@ from typing import Any, Final
 
 from epypes.catalog.lookup import CatalogEntry, entry_of
 from epypes.graph import unwrapped
+from epypes.graph.signature import documented_signature
 
 _CONVERSIONS: Final = ("int", "float", "round", "bool")
 # A user's function may call another, and that another.
 _DEEPEST: Final = 3
-# The first line of a docstring of OpenCV: "blur(src, ksize[, dst[, anchor]]) -> dst".
-_SIGNATURE = re.compile(r"[\w.]+\(([^()]*)\)")
 
 _Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
@@ -68,9 +66,8 @@ def _documented_names(function: Callable[..., Any]) -> tuple[str, ...]:
     if isinstance(function, type):
         function = getattr(function, "create", function)  # an object of OpenCV is made as its create() makes it
     text = getattr(function, "__doc__", None)
-    found = _SIGNATURE.match(text.lstrip()) if isinstance(text, str) else None
-    parts = re.split(r"[\[\],\s]+", found[1]) if found else ()
-    return tuple(filter(None, parts))
+    found = documented_signature(text) if isinstance(text, str) else None
+    return found[0] if found else ()
 
 
 def uses(function: Any, parameter: str) -> tuple[Use, ...]:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import sys
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from epypes.deprecation import old_names
 
 _INTERRUPTED: Final = 130
+
+if not TYPE_CHECKING:
+    __getattr__ = old_names(__name__)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -215,10 +215,10 @@ class Acquisition(Component):
         self.cameras.start()
         super().listen(timeout_s)
 
-    def stop(self, timeout_s: float = 5.0) -> None:
+    def stop(self, timeout_s: float = 5.0, *, drain: bool = False) -> None:
         """Stop the event loop and the cameras."""
         try:
-            super().stop(timeout_s)
+            super().stop(timeout_s, drain=drain)
         finally:
             self.cameras.stop(timeout_s)
 

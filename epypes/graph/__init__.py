@@ -1,5 +1,8 @@
 """What is connected to what: computational graphs, pure and static."""
 
+from typing import TYPE_CHECKING
+
+from epypes.deprecation import old_names
 from epypes.graph.algebra import (
     extend,
     group,
@@ -43,3 +46,6 @@ __all__ = [
     "with_defaults",
     "with_functions",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = old_names(__name__)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Container, Iterable, Mapping
 from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.identity import is_redefined_inside, redefined
@@ -30,7 +31,7 @@ FuncIO = Mapping[str, tuple[Tokens, Tokens | None]]
 _BY_HAND: Final = "name it in CompGraph(func_dict, func_io)"
 
 
-class CompGraph:
+class CompGraph(OldNames):
     """A computational graph: functions joined by tokens, immutable and checked whole.
 
     Parameters
@@ -249,6 +250,7 @@ class CompGraph:
 
         return union(self, other) if isinstance(other, CompGraph) else NotImplemented
 
+    @takes_old_keywords
     def to_networkx(self) -> nx.DiGraph[tuple[str, str]]:
         """Return a networkx DiGraph; its vertices are ``("function", name)`` and ``("token", name)``."""
         with optional_import():

@@ -1,15 +1,20 @@
-"""The signature of a function: the inputs that it takes, and the output tokens that ``@ep.outputs`` names."""
+"""The signature of a function: its inputs, those of a C function by its docstring, and what ``@ep.outputs`` names."""
 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from types import FunctionType
 from typing import Any, Final, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _OUTPUTS: Final = "__epypes_outputs__"
+# The first line of a docstring of OpenCV: "blur(src, ksize[, dst[, anchor]]) -> dst".
+_DOCUMENTED: Final = re.compile(r"[\w.]+\(([^()]*)\)(?: -> (.+))?")
+_BETWEEN_NAMES: Final = re.compile(r"[\[\],\s]+")
 
 
 def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
@@ -18,6 +23,36 @@ def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
         return inspect.signature(function)
     except Exception:  # inspect's own errors, and whatever an object's __signature__ or __getattr__ raises
         return None
+
+
+def documented_signature(docstring: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
+    """Return the parameters and the results in the first line of a docstring, as OpenCV writes it; None without.
+
+    Examples
+    --------
+    >>> documented_signature("circle(img, center, radius, color[, thickness]) -> img")
+    (('img', 'center', 'radius', 'color', 'thickness'), ('img',))
+    """
+    found = _DOCUMENTED.match(docstring.lstrip())
+    if found is None:
+        return None
+    parameters, results = (tuple(filter(None, _BETWEEN_NAMES.split(part or ""))) for part in found.groups())
+    return parameters, results
+
+
+@lru_cache(maxsize=256)
+def documented_in_out(docstring: str) -> tuple[int, ...]:
+    """Return the places of the parameters that are results too, in any of the forms that a docstring of OpenCV lists.
+
+    Examples
+    --------
+    >>> documented_in_out("floodFill(image, mask, seedPoint, newVal[, flags]) -> retval, image, mask, rect")
+    (0, 1)
+    """
+    head = docstring.lstrip().partition("(")[0] + "("
+    forms = [documented_signature(line) for line in docstring.splitlines() if line.lstrip().startswith(head)]
+    shared = {place for form in forms if form for place, name in enumerate(form[0]) if name in form[1]}
+    return tuple(sorted(shared))
 
 
 def positional_of(signature: inspect.Signature) -> list[inspect.Parameter]:

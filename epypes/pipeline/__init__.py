@@ -1,6 +1,9 @@
 """The paper's ladder: Node, Pipeline, and the pipelines that answer events."""
 
-from epypes.pipeline.event_loop import EventLoop
+from typing import TYPE_CHECKING
+
+from epypes.deprecation import old_names
+from epypes.pipeline.event_loop import EventLoop, wait
 from epypes.pipeline.mailbox import Mailbox
 from epypes.pipeline.node import Node, NodeBasedCompGraph
 from epypes.pipeline.pipeline import Pipeline, Stage, Stages
@@ -19,4 +22,8 @@ __all__ = [
     "Stage",
     "Stages",
     "Stamps",
+    "wait",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = old_names(__name__)

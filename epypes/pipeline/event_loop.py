@@ -10,12 +10,12 @@ import atexit
 import logging
 import queue
 import threading
-import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Any, Final
 
+from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import BrokerError, StillRunning
 from epypes.pipeline.pipeline import Pipeline
 
@@ -27,7 +27,8 @@ LONGEST_POLL_S: Final = 0.2
 
 _log: Final = logging.getLogger("epypes.pipeline")
 
-_left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
+# Those that have been started; one that runs is kept alive by its thread.
+_started: weakref.WeakSet[EventLoop] = weakref.WeakSet()
 
 
 def log_error(text: str, *parts: object, error: BaseException | None) -> None:
@@ -92,7 +93,7 @@ def _text_of(error: BaseException) -> str:
         return kind
 
 
-class EventLoop:
+class EventLoop(OldNames):
     """A daemon thread that takes events from a queue and, for each, runs a pipeline or calls a function.
 
     With a Pipeline it calls ``callback.run(**f_in(event))``, or ``callback.handle(event)`` of one that reacts to events
@@ -122,6 +123,7 @@ class EventLoop:
     Semeniuta and Falkman 2019, "Reactive pipelines".
     """
 
+    @takes_old_keywords
     def __init__(
         self,
         q_in: Any,
@@ -176,23 +178,34 @@ class EventLoop:
             thread = threading.Thread(target=self._loop, args=(self._stop,), name=f"epypes {self.name}", daemon=True)
             thread.start()
             self._thread = thread
-            _left_running.add(self)
+            _started.add(self)
             return True
 
-    def stop(self, timeout_s: float = 5.0) -> None:
+    def stop(self, timeout_s: float = 5.0, *, drain: bool = False) -> None:
         """Stop after the event under way; may be called twice, from any thread, the loop's own included.
 
-        Events that are still in the queue stay there.
+        Parameters
+        ----------
+        timeout_s
+            How long it is waited for, in seconds.
+        drain
+            Whether the events that are in the queue are worked off before; without it they stay there. Those that are
+            not worked off within ``timeout_s`` stay there too.
 
         Raises
         ------
         StillRunning
-            The event under way took longer than ``timeout_s``; the functions are named.
+            The event under way, or the queue, took longer than ``timeout_s``; the functions are named.
         """
+        if drain and not self.drain(timeout_s):
+            busy = self._busy()
+            self._stop.set()
+            raise StillRunning(self.name, busy, timeout_s)
+        if drain and self._thread is threading.current_thread():
+            return  # it ends when its queue is empty
         with self._lock:
             self._stop.set()
             thread = self._thread
-            _left_running.discard(self)
         if thread is None or thread is threading.current_thread():
             return
         thread.join(timeout_s)
@@ -207,6 +220,21 @@ class EventLoop:
             return True
         thread.join(timeout_s)
         return not thread.is_alive()
+
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait until the loop has been stopped and its thread has ended; return whether it has.
+
+        Returns at once for a loop that does not run, and on its own thread.
+
+        Parameters
+        ----------
+        timeout_s
+            How long to wait, in seconds; without it, for as long as it takes. Ctrl-C raises KeyboardInterrupt.
+        """
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(timeout_s)
+        return not self.is_running
 
     def _loop(self, stop: threading.Event) -> None:
         is_stopped, poll_s = stop.is_set, POLL_S
@@ -273,13 +301,50 @@ class EventLoop:
         return f"<EventLoop {self.name!r:.40}: {state}, {self.handled} events>"
 
 
+def wait(timeout_s: float | None = None) -> bool:
+    """Wait until every event loop and listening pipeline of this process has stopped; return whether they have.
+
+    Their threads are daemons, so a program that only starts pipelines would end at once. Ctrl-C stops all of them, each
+    after its event under way, and ends the wait.
+
+    Parameters
+    ----------
+    timeout_s
+        How long to wait, in seconds; without it, for as long as it takes.
+
+    Raises
+    ------
+    StillRunning
+        After Ctrl-C: an event under way took longer than five seconds.
+    """
+    deadline_s = None if timeout_s is None else monotonic() + timeout_s
+    try:
+        # Those that are started meanwhile count too.
+        while running := _running_elsewhere():
+            if not running[0].join(None if deadline_s is None else max(0.0, deadline_s - monotonic())):
+                return False
+    except KeyboardInterrupt:
+        running = _running_elsewhere()
+        for loop in running:
+            loop._stop.set()
+        for loop in running:
+            loop.stop()
+    return True
+
+
+def _running_elsewhere() -> list[EventLoop]:
+    """Return the loops that run on other threads than this one."""
+    here = threading.current_thread()
+    return [loop for loop in list(_started) if loop.is_running and loop._thread is not here]
+
+
 @atexit.register
 def _warn_of_running_loops() -> None:
-    for loop in list(_left_running):
-        if loop.is_running:
-            warnings.warn(
-                f"{loop.name!r} was left running. Call stop(), or use it in a with statement.",
-                ResourceWarning,
-                stacklevel=1,
-                source=loop,
+    for loop in list(_started):
+        if loop.is_running and not loop._stop.is_set():
+            # Logged, since a ResourceWarning is hidden by default, and a program that ends at once should say why.
+            _log.warning(
+                "%r was left running when the program ended: its thread is a daemon. Call its join(), or ep.wait(), to "
+                "go on until it is stopped; call its stop(), or use it in a with statement, to end it.",
+                loop.name,
             )

@@ -10,6 +10,7 @@ from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any, cast
 from weakref import ref
 
+from epypes.deprecation import OldNames
 from epypes.graph import CompGraph
 from epypes.run.guard import WATCH, called_for
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from epypes.run.program import Program
 
 
-class Node:
+class Node(OldNames):
     """The runtime counterpart of a function: callable with positional inputs, measures its time.
 
     Made for subclassing: override ``compute`` to do something around, or instead of, the function.
@@ -104,6 +105,12 @@ class Node:
         """Whether it comes to the same to call ``func``, and to count the call later."""
         kind = type(self)
         return kind.__call__ is Node.__call__ and kind.compute is Node.compute and "compute" not in vars(self)
+
+    def stop(self) -> None:
+        """Release what the node holds, such as a camera; the hook for subclasses.
+
+        A pipeline calls it for each of its nodes when it is stopped, which may be more than once.
+        """
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call)``; a pipeline adds its nodes' tuples as a third item."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import keyword
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any, Literal
 
+from epypes.deprecation import takes_old_keywords
 from epypes.errors import HyperparameterError, PayloadError
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
@@ -68,6 +70,8 @@ class Pipeline(Node, TokenMapping):
         Values of hyperparameter tokens.
     workers
         How many functions may run at once, in threads; see CompGraphRunner.
+    guard
+        Whether functions get arrays as read-only views and containers as copies; see CompGraphRunner.
 
     Attributes
     ----------
@@ -81,12 +85,21 @@ class Pipeline(Node, TokenMapping):
     Semeniuta and Falkman 2019, "Nodes and pipelines".
     """
 
-    def __init__(self, name: str, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, workers: int = 1) -> None:
+    @takes_old_keywords
+    def __init__(
+        self,
+        name: str,
+        cg: CompGraph,
+        hparams: Mapping[str, Any] | None = None,
+        *,
+        workers: int = 1,
+        guard: bool = True,
+    ) -> None:
         if not isinstance(cg, CompGraph):
             way_out = "Give its graph: .cg" if isinstance(getattr(cg, "cg", None), CompGraph) else "Pipeline(name, cg)"
             raise TypeError(f"A pipeline runs a CompGraph, not {type(cg).__name__!r}. {way_out}.")
         self.network = NodeBasedCompGraph(cg)
-        self.runner = CompGraphRunner(self.network, hparams, workers=workers)
+        self.runner = CompGraphRunner(self.network, hparams, workers=workers, guard=guard)
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
         super().__init__(name, self.__call__)
@@ -206,6 +219,12 @@ class Pipeline(Node, TokenMapping):
             if not _allows(hint, value):
                 text = f"{token}={value!r:.60} is not what its annotation allows: {hint!r:.200}. Nothing was set."
                 raise HyperparameterError(token, text)
+
+    def stop(self) -> None:
+        """Stop the nodes, the last one first, so that each releases what it holds; all of them, even if one fails."""
+        with contextlib.ExitStack() as stops:
+            for node in self.network.nodes.values():
+                stops.callback(node.stop)
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call, the nodes' tuples)``; 0 seconds for nodes that it left out."""

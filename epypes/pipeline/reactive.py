@@ -15,6 +15,7 @@ from threading import get_ident
 from time import perf_counter_ns, time_ns
 from typing import Any, Final, Self
 
+from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.pipeline.event_loop import EventLoop, is_kept, log_error, settle
@@ -77,7 +78,7 @@ class Stamps:
         return f"<Stamps of an event: {', '.join(known) or 'just taken'}>"
 
 
-class EventView(Mapping[str, Any]):
+class EventView(OldNames, Mapping[str, Any]):
     """One event's run of a pipeline: what f_out is given, never shared with another event.
 
     Reads like the pipeline: ``view["edges"]``, ``view.attributes``, ``view.traverse_time()``.
@@ -206,6 +207,7 @@ class SourcePipeline(_Answering):
         Called on the thread that runs the pipeline, with this event's EventView.
     """
 
+    @takes_old_keywords
     def __init__(
         self,
         name: str,
@@ -215,8 +217,9 @@ class SourcePipeline(_Answering):
         hparams: Mapping[str, Any] | None = None,
         *,
         workers: int = 1,
+        guard: bool = True,
     ) -> None:
-        super().__init__(name, cg, hparams, workers=workers)
+        super().__init__(name, cg, hparams, workers=workers, guard=guard)
         self.q_out, self.f_out = q_out, f_out
         self._events = {}
 
@@ -264,6 +267,7 @@ class SinkPipeline(Pipeline):
     # Whether `handle` puts the answer of f_out on q_out itself, which takes a call less than `emit`.
     _has_usual_emit = False
 
+    @takes_old_keywords
     def __init__(
         self,
         name: str,
@@ -273,8 +277,9 @@ class SinkPipeline(Pipeline):
         hparams: Mapping[str, Any] | None = None,
         *,
         workers: int = 1,
+        guard: bool = True,
     ) -> None:
-        super().__init__(name, cg, hparams, workers=workers)
+        super().__init__(name, cg, hparams, workers=workers, guard=guard)
         self.q_in, self.f_in = q_in, f_in
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
@@ -433,15 +438,36 @@ class SinkPipeline(Pipeline):
         """
         self.loop.start(timeout_s)
 
-    def stop(self, timeout_s: float = 5.0) -> None:
-        """Stop the event loop; may be called twice, before listen(), and from any thread.
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait until the pipeline has been stopped; return whether it has.
+
+        Parameters
+        ----------
+        timeout_s
+            How long to wait, in seconds; without it, for as long as it takes. Ctrl-C raises KeyboardInterrupt.
+        """
+        return self.loop.join(timeout_s)
+
+    def stop(self, timeout_s: float = 5.0, *, drain: bool = False) -> None:
+        """Stop the event loop, then the nodes; may be called twice, before listen(), and from any thread.
+
+        Inside an event, the loop ends after it, and the nodes are not stopped.
+
+        Parameters
+        ----------
+        timeout_s
+            How long it is waited for, in seconds.
+        drain
+            Whether the events that are on ``q_in`` are worked off before; without it they stay there.
 
         Raises
         ------
         StillRunning
-            A function did not return within ``timeout_s``.
+            A function, or with ``drain`` the queue, took longer than ``timeout_s``.
         """
-        self.loop.stop(timeout_s)
+        self.loop.stop(timeout_s, drain=drain)
+        if not self.loop.is_running:
+            super().stop()
 
     def __enter__(self) -> Self:
         self.listen()
@@ -484,6 +510,7 @@ class FullPipeline(_Answering, SinkPipeline):
     42
     """
 
+    @takes_old_keywords
     def __init__(
         self,
         name: str,
@@ -495,8 +522,9 @@ class FullPipeline(_Answering, SinkPipeline):
         hparams: Mapping[str, Any] | None = None,
         *,
         workers: int = 1,
+        guard: bool = True,
     ) -> None:
-        super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
+        super().__init__(name, cg, q_in, f_in, hparams, workers=workers, guard=guard)
         self.q_out, self.f_out = q_out, f_out
         self._has_usual_emit = type(self).emit is FullPipeline.emit
 

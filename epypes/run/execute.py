@@ -32,6 +32,7 @@ from epypes.run.guard import (
     keep,
     lend,
     writable,
+    writable_copy,
 )
 from epypes.run.program import Program, Step
 from epypes.run.snapshot import Snapshot
@@ -176,7 +177,7 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
         It does not keep to its contract, changed an object inside an input, or returned what can be read only once.
     """
     # Unpacked at once: to look up one field of a named tuple takes as long.
-    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node = step
+    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node, _ = step
     if node is not None:
         function = node.func
     start_ns = 0
@@ -212,7 +213,10 @@ def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
     """Return the inputs of a step that is not plain; a switch passes values on as they are stored."""
     args = [values[slot] for slot in step.inputs]
     if program.guard and step.switch is None:
-        args = [writable(arg) if step.unguarded else lend(arg) for arg in args]
+        lent = [writable(arg) if step.unguarded else lend(arg) for arg in args]
+        for at in step.in_out:
+            lent[at] = writable_copy(args[at])
+        args = lent
     if step.contracts is not None:
         _check(program, step, step.contracts[0], step.inputs, args)
     return args

@@ -16,10 +16,12 @@ from array import array as number_array
 from collections import deque
 from collections.abc import Callable, Sequence
 from sys import getrefcount
-from types import FunctionType
+from types import BuiltinFunctionType, FunctionType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from epypes.errors import IteratorRefused
+from epypes.graph.identity import innermost
+from epypes.graph.signature import documented_in_out
 
 if TYPE_CHECKING:
     from epypes.run.program import Program
@@ -61,6 +63,22 @@ def unguarded(function: F) -> F:
 def is_unguarded(function: object) -> bool:
     """Whether a function, or the function that it wraps, is marked as unguarded."""
     return bool(getattr(function, _MARK, False))
+
+
+def in_out_places(function: Any, count: int) -> tuple[int, ...]:
+    """Return at which of ``count`` inputs a function of OpenCV, as ``cv2.circle``, writes its results into them.
+
+    That is read from the docstrings of C functions, which name such a parameter among the results too. A function in
+    Python is the user's own, and writes into copies that it makes itself.
+    """
+    if type(function) is FunctionType:
+        return ()
+    function, given = innermost(function), 0
+    while type(function) is functools.partial:
+        function, given = function.func, given + len(function.args)
+    if type(function) is not BuiltinFunctionType or not function.__doc__ or " -> " not in function.__doc__:
+        return ()
+    return tuple(place - given for place in documented_in_out(function.__doc__) if 0 <= place - given < count)
 
 
 def called_for(name: str, function: Any) -> Any:
@@ -344,6 +362,14 @@ def writable(value: Any) -> Any:
         return view
     made = _own_copy(value)
     return _with_items(made, writable) if _holds_arrays(made) else made
+
+
+def writable_copy(value: Any) -> Any:
+    """Return a value as a function gets it that writes into it: a copy, with copies of the arrays in it."""
+    if is_array(value):
+        return value.copy()
+    made = _own_copy(value)
+    return _with_items(made, writable_copy) if _holds_arrays(made) else made
 
 
 _unlocking = threading.Lock()

@@ -16,7 +16,7 @@ from weakref import ref
 from epypes.graph import CompGraph, Switch, as_switch
 from epypes.graph.signature import distinct
 from epypes.images import Contracts
-from epypes.run.guard import called_for, is_unguarded
+from epypes.run.guard import called_for, in_out_places, is_unguarded
 
 # What a function has that keeps hyperparameters of its own: a method that returns another value whenever they have
 # changed, given the programs that ask for it.
@@ -50,6 +50,8 @@ class Step(NamedTuple):
         Whether its inputs are lent and nothing more is to be done about them.
     node
         The function, if it is a node whose ``func`` may be called in its place.
+    in_out
+        The places of the inputs into which it writes its results, and of which it gets copies.
     """
 
     place: int
@@ -63,6 +65,7 @@ class Step(NamedTuple):
     contracts: Contracts | None
     is_plain: bool
     node: Any
+    in_out: tuple[int, ...]
 
 
 class Program:
@@ -258,6 +261,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
     for place, ((name, function), (inputs, outputs, io)) in enumerate(zip(cg.functions.items(), sides, strict=True)):
         function = called_for(name, function)
         unguarded, switch, contract = is_unguarded(function), switches.get(name), contracts.get(name)
+        in_out = in_out_places(function, len(inputs))
         has_node = hasattr(type(function), IS_ITS_FUNC) and getattr(function, IS_ITS_FUNC)
         yield _new_step((
             place,
@@ -269,8 +273,9 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
             unguarded,
             switch,
             contract,
-            lends_only and not unguarded and switch is None and contract is None,
+            lends_only and not unguarded and switch is None and contract is None and not in_out,
             function if has_node else None,
+            in_out,
         ))  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from time import perf_counter_ns
 from typing import Any, Final
 from weakref import ref
 
+from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
 from epypes.run.execute import CompiledRun, Executor
@@ -29,7 +30,7 @@ _LOG: Final = logging.getLogger(__name__)
 _MAX_TARGETS: Final = 64
 
 
-class CompGraphRunner(TokenMapping):
+class CompGraphRunner(OldNames, TokenMapping):
     """Runs a graph; a mapping of its tokens that can be read now.
 
     These are the hyperparameters, and what the last run has left that is not stale, in graph order. Reading any other
@@ -73,6 +74,7 @@ class CompGraphRunner(TokenMapping):
     7
     """
 
+    @takes_old_keywords
     def __init__(
         self,
         cg: CompGraph,

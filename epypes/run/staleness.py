@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from epypes.deprecation import OldNames
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph import CompGraph
 from epypes.run.guard import is_plain_array, is_same_guarded_array, lend
@@ -33,7 +34,7 @@ class _NotComputed:
 NOT_COMPUTED: Final = _NotComputed()
 
 
-class TokenManager:
+class TokenManager(OldNames):
     """The values of a graph's tokens; they do not change any more when their run has ended.
 
     A runner delegates storage to it: each run works on values of its own, so concurrent runs never see each other's,

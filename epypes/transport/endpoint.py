@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+from epypes.deprecation import OldNames
 from epypes.errors import AddressError
 from epypes.optional import optional_import
 from epypes.transport.address import Address, open_channel, parse_address
@@ -52,7 +53,7 @@ def warn_left_running(name: str) -> None:
     warnings.warn(f"{name} was left running. Call stop(), or use with.", ResourceWarning, stacklevel=3)
 
 
-class Endpoint(Startable):
+class Endpoint(OldNames, Startable):
     """A Subscriber or a Publisher; it has a channel while it runs.
 
     Attributes
