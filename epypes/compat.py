@@ -345,7 +345,10 @@ MODULES: Final[Mapping[str, Mapping[str, Old]]] = {
     },
     "epypes.protobuf": {},
     **_WIRE,
-    "epypes.protobuf.pbtypes": {name: old for names in _WIRE.values() for name, old in names.items()},
+    "epypes.protobuf.pbtypes": {
+        **{name: old for names in _WIRE.values() for name, old in names.items()},
+        "enable_protobuf_types": Old("nothing: the classes of epypes.wire need no path"),
+    },
     "epypes.protobuf.pbprocess": {
         "add_attribute": _moved("epypes.wire.add_attribute", "epypes.wire.add_attribute"),
         "get_attributes_dict": Old("epypes.wire.attributes(message)"),

@@ -2,8 +2,8 @@
 
 Classes inherit `OldNames`, packages that had other names get ``__getattr__`` from `old_names`, and functions whose
 parameters were renamed are decorated with `takes_old_keywords`. What an old name answers is in the table of
-``epypes.compat``, which imports the upper rooms and is loaded when an old name is used first. Nothing here is reached
-by a program that uses none.
+``epypes.compat``, which imports the upper rooms and is loaded when an object is first asked for an attribute that it
+has not.
 """
 
 from __future__ import annotations
