@@ -139,6 +139,7 @@ class EventLoop(OldNames):
         self.handled = 0
         self._stop = threading.Event()
         self._draining = threading.Event()
+        self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
 
@@ -174,8 +175,9 @@ class EventLoop(OldNames):
                     self._stop.clear()
                 return not self._stop.is_set()
             self._draining.clear()
-            self._stop = threading.Event()
-            thread = threading.Thread(target=self._loop, args=(self._stop,), name=f"epypes {self.name}", daemon=True)
+            self._stop, self._ended = threading.Event(), threading.Event()
+            arguments = self._stop, self._ended
+            thread = threading.Thread(target=self._loop, args=arguments, name=f"epypes {self.name}", daemon=True)
             thread.start()
             self._thread = thread
             _started.add(self)
@@ -197,25 +199,24 @@ class EventLoop(OldNames):
         StillRunning
             The event under way, or the queue, took longer than ``timeout_s``; the functions are named.
         """
-        if drain and not self.drain(timeout_s):
-            busy = self._busy()
-            self._stop.set()
-            raise StillRunning(self.name, busy, timeout_s)
-        if drain and self._thread is threading.current_thread():
-            return  # it ends when its queue is empty
+        is_late = drain and not self.drain(timeout_s)
         with self._lock:
-            self._stop.set()
             thread = self._thread
-        if thread is None or thread is threading.current_thread():
+            is_own = thread is threading.current_thread()
+            if not (drain and is_own):  # that ends when its queue is empty
+                self._stop.set()
+        if thread is None or is_own:
             return
-        thread.join(timeout_s)
-        if thread.is_alive():
+        if not is_late:
+            thread.join(timeout_s)
+        if is_late or thread.is_alive():
             raise StillRunning(self.name, self._busy(), timeout_s)
 
     def drain(self, timeout_s: float = 5.0) -> bool:
         """Work off what is in the queue, then stop; return whether that was done within ``timeout_s``."""
         self._draining.set()
-        thread = self._thread
+        with self._lock:
+            thread = self._thread
         if thread is None or thread is threading.current_thread():
             return True
         thread.join(timeout_s)
@@ -231,12 +232,20 @@ class EventLoop(OldNames):
         timeout_s
             How long to wait, in seconds; without it, for as long as it takes. Ctrl-C raises KeyboardInterrupt.
         """
-        thread = self._thread
-        if thread is not None and thread is not threading.current_thread():
-            thread.join(timeout_s)
+        with self._lock:
+            thread, ended = self._thread, self._ended
+        # Not Thread.join: before Python 3.13, one that Ctrl-C interrupts takes the thread for ended.
+        if thread is not None and thread is not threading.current_thread() and ended.wait(timeout_s):
+            thread.join()
         return not self.is_running
 
-    def _loop(self, stop: threading.Event) -> None:
+    def _loop(self, stop: threading.Event, ended: threading.Event) -> None:
+        try:
+            self._take_events(stop)
+        finally:
+            ended.set()
+
+    def _take_events(self, stop: threading.Event) -> None:
         is_stopped, poll_s = stop.is_set, POLL_S
         while not is_stopped():
             try:
@@ -329,6 +338,8 @@ def wait(timeout_s: float | None = None) -> bool:
             loop._stop.set()
         for loop in running:
             loop.stop()
+            if loop._pipeline is not None:
+                loop._pipeline.stop()  # its nodes too
     return True
 
 

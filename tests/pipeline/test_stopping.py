@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import itertools
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -260,3 +261,140 @@ def test_a_stop_that_runs_out_of_time_says_so_and_may_be_repeated():
     release.set()
     pipe.stop()
     assert pipe.q_out.get_nowait() == 1
+
+
+# -- what is queued, and waiting for the end --------------------------------------------------------------------------
+
+
+def test_stop_leaves_queued_events_unless_it_drains():
+    pipe = full()
+    for event in range(50):
+        pipe.q_in.put(event)
+    pipe.listen()
+    pipe.stop(TIMEOUT_S, drain=True)
+    assert not pipe.loop.is_running
+    assert [pipe.q_out.get_nowait() for _ in range(50)] == list(range(50))
+    pipe.q_in.put(50)
+    pipe.stop(drain=True)
+    assert pipe.q_in.qsize() == 1, "a pipeline that does not listen works nothing off"
+
+
+def test_a_queue_that_is_not_drained_in_time_is_named_and_the_pipeline_stops_all_the_same():
+    started, release = threading.Event(), threading.Event()
+
+    def hold(x):
+        started.set()
+        assert release.wait(TIMEOUT_S)
+        return x
+
+    pipe = full(cg=ep.CompGraph({"hold": hold}, {"hold": ("x", "y")}))
+    for event in range(3):
+        pipe.q_in.put(event)
+    pipe.listen()
+    assert started.wait(TIMEOUT_S)
+    with pytest.raises(StillRunning, match="did not stop within 0.01 s: still in 'hold'"):
+        pipe.stop(0.01, drain=True)
+    release.set()
+    assert pipe.join(TIMEOUT_S)
+    assert (pipe.q_in.qsize(), pipe.q_out.qsize()) == (2, 1)
+
+
+def test_a_drain_from_inside_an_event_ends_the_loop_when_the_queue_is_empty():
+    pipe = full(f_out=lambda view: (pipe.stop(drain=True), view["y"])[1])
+    for event in range(3):
+        pipe.q_in.put(event)
+    pipe.listen()
+    assert pipe.join(TIMEOUT_S)
+    assert pipe.q_out.qsize() == 3
+
+
+def test_join_waits_until_another_thread_stops_the_pipeline():
+    pipe = full()
+    assert pipe.join(), "one that does not listen has ended"
+    pipe.listen()
+    assert not pipe.join(0.01)
+    stopper = threading.Thread(target=pipe.stop)
+    stopper.start()
+    assert pipe.join(TIMEOUT_S)
+    stopper.join(TIMEOUT_S)
+    assert not pipe.loop.is_running
+
+
+def test_wait_ends_when_all_pipelines_have_stopped():
+    first, second = full(), full()
+    first.listen()
+    second.listen()
+    assert not ep.wait(0.01)
+    waiter = threading.Thread(target=ep.wait, daemon=True)
+    waiter.start()
+    first.stop()
+    assert waiter.is_alive()
+    second.stop()
+    waiter.join(TIMEOUT_S)
+    assert not waiter.is_alive()
+    assert ep.wait()
+
+
+def test_wait_inside_an_event_does_not_wait_for_its_own_loop():
+    pipe = full(f_out=lambda view: ep.wait(TIMEOUT_S))
+    with pipe:
+        pipe.q_in.put(1)
+        assert pipe.q_out.get(timeout=TIMEOUT_S) is True
+
+
+def test_a_script_that_waits_answers_events_until_ctrl_c_and_ends_in_order():
+    code = (
+        "import queue, sys, epypes as ep\n"
+        "class Camera(ep.Node):\n"
+        "    def stop(self): print('camera closed', flush=True)\n"
+        "cg = ep.CompGraph({'show': Camera('camera', lambda x: print('event', x, flush=True))}, {'show': ('x', None)})\n"
+        "pipe = ep.SinkPipeline('p', cg, queue.Queue(), lambda e: {'x': e})\n"
+        "pipe.listen(); pipe.q_in.put(1)\n"
+        "print(ep.wait(), pipe.loop.is_running, flush=True)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stdout.readline() == "event 1\n"
+        run.send_signal(signal.SIGINT)
+        out, err = run.communicate(timeout=TIMEOUT_S)
+    assert (run.returncode, out, err) == (0, "camera closed\nTrue False\n", "")
+
+
+class Closed(ep.Node):
+    """A node that holds something, which it notes in a list when it is stopped."""
+
+    def __init__(self, name, stopped, error=None):
+        super().__init__(name, lambda x: x)
+        self.stopped, self.error = stopped, error
+
+    def stop(self):
+        self.stopped.append(self.name)
+        if self.error is not None:
+            raise self.error
+
+
+@pytest.mark.parametrize("kind", ["Pipeline", "FullPipeline"])
+def test_a_pipeline_stops_its_nodes_the_last_one_first_even_if_one_fails(kind):
+    stopped = []
+    cg = ep.CompGraph(
+        {"f": Closed("a", stopped), "g": Closed("b", stopped, OSError("b is stuck")), "h": Closed("c", stopped)},
+        {"f": ("x", "u"), "g": ("u", "v"), "h": ("v", "y")},
+    )
+    pipe = ep.Pipeline("p", cg) if kind == "Pipeline" else full(cg=cg)
+    with pytest.raises(OSError, match="b is stuck"):
+        pipe.stop()
+    assert stopped == ["c", "b", "a"]
+
+
+def test_a_stop_inside_an_event_leaves_the_nodes_to_the_event():
+    stopped, answered = [], threading.Event()
+    cg = ep.CompGraph({"f": Closed("a", stopped)}, {"f": ("x", "y")})
+    pipe = full(cg=cg, f_out=lambda view: (pipe.stop(), answered.set(), len(stopped))[-1])
+    pipe.q_in.put(1)
+    pipe.listen()
+    assert answered.wait(TIMEOUT_S)
+    assert pipe.join(TIMEOUT_S)
+    assert pipe.q_out.get_nowait() == 0
+    pipe.stop()
+    assert stopped == ["a"]

@@ -43,7 +43,9 @@ cg = add_new_vertices(
         "gather": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired"),
     },
 )
-cg = add_new_vertices(cg, {"gather": gather}, {"gather": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired")})
+cg = add_new_vertices(
+    cg, {"gather": gather}, {"gather": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired")}
+)
 cg = graph_union(cg, CompGraph({"count": len}, {"count": ("matches", "n_matches")}))
 
 pipe = Pipeline("orb", cg, frozen_tokens={"nfeatures": 60, "crossCheck": True, "mask_1": None, "mask_2": None})
