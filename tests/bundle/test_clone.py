@@ -19,11 +19,11 @@ def test_a_graph_of_functions_is_its_own_and_keeps_its_defaults():
 
 
 def test_what_a_pipeline_was_set_to_goes_along_and_what_was_unfrozen_stays_an_input():
-    pipeline = ep.Pipeline("times", ep.CompGraph.from_functions(times), {"gain": 5.0}, workers=2)
+    pipeline = ep.Pipeline("times", ep.CompGraph.from_functions(times), {"gain": 5.0}, workers=2, guard=False)
     cg = ep.CompGraph({"times": pipeline}, {"times": ("x", "y")})
     own = clone_graph(cg).functions["times"]
     assert own is not pipeline
-    assert (own(3), own.runner.workers, pipeline.run_count) == (15.0, 2, 0)
+    assert (own(3), own.runner.workers, own.runner.guard, pipeline.run_count) == (15.0, 2, False, 0)
     pipeline.runner.unfreeze("gain")
     cg = ep.CompGraph({"times": pipeline}, {"times": (("x", "gain"), "y")})
     assert clone_graph(cg).functions["times"](3, 4) == 12
