@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from epypes.deprecation import old_names
 from epypes.graph.algebra import (
+    delay,
     extend,
     group,
     names_of,
@@ -20,14 +21,17 @@ from epypes.graph.placeholder import Placeholder, is_placeholder
 from epypes.graph.signature import outputs
 from epypes.graph.switch import Switch, as_switch, switch
 from epypes.graph.token_annotations import annotated_params, colour_order, image_hint
+from epypes.graph.validation import Delay
 
 __all__ = [
     "CompGraph",
+    "Delay",
     "Placeholder",
     "Switch",
     "annotated_params",
     "as_switch",
     "colour_order",
+    "delay",
     "extend",
     "group",
     "image_hint",
