@@ -216,10 +216,8 @@ def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
     """Return the inputs of a step that is not plain; a switch passes values on as they are stored."""
     args = [values[slot] for slot in step.inputs]
     if program.guard and step.switch is None:
-        lent = [writable(arg) if step.unguarded else lend(arg) for arg in args]
-        for at in step.in_out:
-            lent[at] = writable_copy(args[at])
-        args = lent
+        pass_on = writable if step.unguarded else lend
+        args = [(writable_copy if at in step.in_out else pass_on)(arg) for at, arg in enumerate(args)]
     if step.contracts is not None:
         _check(program, step, step.contracts[0], step.inputs, args)
     return args
