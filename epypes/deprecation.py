@@ -34,7 +34,7 @@ REMOVED: Final[Mapping[str, str]] = {
 }
 _OLD: Final = frozenset({*RENAMED, *REMOVED})
 _TABLE: Final = "epypes.compat"
-_PAGE: Final = "docs/from_0_1.md has all of them."
+_PAGE: Final = "See docs/from_0_1.md."
 
 
 def describe(old: str, new: str) -> str:

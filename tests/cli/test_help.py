@@ -15,7 +15,7 @@ from epypes.transport.address import parse_address
 
 COMMANDS = [[name] for name in app.commands] + [["export", name] for name in app.commands["export"].commands]
 # The rooms of EPypes that the command line may import before it knows what to do.
-LIGHT = {"deprecation", "cli", "errors", "optional", "wording"}
+LIGHT = {"cli", "deprecation", "errors", "optional", "wording"}
 # Besides the standard library.
 LIBRARIES = {"click", "epypes"}
 # Each command has a process of its own, forked from one that has imported what all of them need.
