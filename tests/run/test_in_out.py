@@ -79,6 +79,11 @@ def test_a_partial_has_its_remaining_arguments_copied():
     run = into(image, args=(black(),)).run(mask=mask, seed=(1, 1), value=9)
     assert run["reached"].any()
     assert not mask.any()
+    points = [cv2.KeyPoint(5, 5, 4)]
+    cg = ep.CompGraph({"draw": functools.partial(cv2.drawKeypoints, black(), points)}, {"draw": ("canvas", "drawn")})
+    canvas = np.zeros((24, 24, 3), np.uint8)
+    assert ep.CompGraphRunner(cg).run(canvas=canvas)["drawn"].any()
+    assert not canvas.any()
 
 
 def test_arrays_in_a_list_that_is_written_into_are_copied_too():
