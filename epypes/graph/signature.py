@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from types import FunctionType
 from typing import Any, Final, TypeVar
 
@@ -40,7 +39,6 @@ def documented_signature(docstring: str) -> tuple[tuple[str, ...], tuple[str, ..
     return parameters, results
 
 
-@lru_cache(maxsize=256)
 def documented_in_out(docstring: str) -> tuple[int, ...]:
     """Return the places of the parameters that are results too, in any of the forms that a docstring of OpenCV lists.
 

@@ -12,6 +12,7 @@ import functools
 import re
 import sys
 import threading
+import weakref
 from array import array as number_array
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -65,6 +66,10 @@ def is_unguarded(function: object) -> bool:
     return bool(getattr(function, _MARK, False))
 
 
+# By C function, the places that its docstring names: to ask for one of 3 kB takes longer than all else here.
+_IN_OUT: Final[weakref.WeakKeyDictionary[Any, tuple[int, ...]]] = weakref.WeakKeyDictionary()
+
+
 def in_out_places(function: Any, count: int) -> tuple[int, ...]:
     """Return at which of ``count`` inputs a function of OpenCV, as ``cv2.circle``, writes its results into them.
 
@@ -76,9 +81,12 @@ def in_out_places(function: Any, count: int) -> tuple[int, ...]:
     function, given = innermost(function), 0
     while type(function) is functools.partial:
         function, given = function.func, given + len(function.args)
-    if type(function) is not BuiltinFunctionType or not function.__doc__ or " -> " not in function.__doc__:
+    if type(function) is not BuiltinFunctionType:
         return ()
-    return tuple(place - given for place in documented_in_out(function.__doc__) if 0 <= place - given < count)
+    places = _IN_OUT.get(function)
+    if places is None:
+        places = _IN_OUT[function] = documented_in_out(function.__doc__ or "")
+    return tuple([place - given for place in places if 0 <= place - given < count]) if places else ()
 
 
 def called_for(name: str, function: Any) -> Any:
