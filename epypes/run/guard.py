@@ -78,11 +78,13 @@ def in_out_places(function: Any, count: int) -> tuple[int, ...]:
     """
     if type(function) is FunctionType:
         return ()
-    function, given = innermost(function), 0
-    while type(function) is functools.partial:
-        function, given = function.func, given + len(function.args)
+    given = 0
     if type(function) is not BuiltinFunctionType:
-        return ()
+        function = innermost(function)
+        while type(function) is functools.partial:
+            function, given = function.func, given + len(function.args)
+        if type(function) is not BuiltinFunctionType:
+            return ()
     places = _IN_OUT.get(function)
     if places is None:
         places = _IN_OUT[function] = documented_in_out(function.__doc__ or "")
