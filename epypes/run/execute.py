@@ -1,7 +1,8 @@
 """Running steps: compiled where a run repeats, one by one otherwise, in threads where the last times say that they pay.
 
 All three ways change one `TokenManager` and one list of durations by step, so what is left of a run that fails is the
-same in each. The step that is being run is written down before its inputs are read.
+same in each. The step that is being run is written down before its inputs are read. A compiled run ends at the first
+step that is given Nothing, before it is called; the loop goes on from there. So the compiled run need not look for it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any, Final
 
 from epypes.errors import ContractBroken, InputMutated, OutputArityError
 from epypes.images import Image
+from epypes.nothing import Nothing, NothingGiven
 from epypes.run.guard import (
     ARRAYLESS,
     FRESH,
@@ -110,10 +112,14 @@ class Executor:
             if side_by_side:
                 SideBySide(tokens, wanted, durations_ns, self._workers).run()
             elif (compiled := self._find(key, tokens, wanted, plain, changed)) is not None:
-                compiled(tokens, tokens.values, tokens.dirty, durations_ns)
-                if tokens.origin is None:
-                    left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
-                    tokens.dirty = bytearray(left_out)
+                try:
+                    compiled(tokens, tokens.values, tokens.dirty, durations_ns)
+                except NothingGiven:
+                    go_on_one_by_one(tokens, wanted, durations_ns)
+                else:
+                    if tokens.origin is None:
+                        left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
+                        tokens.dirty = bytearray(left_out)
             else:
                 run_one_by_one(tokens, wanted, durations_ns)
                 if len(self._program.steps) <= _MAX_STEPS:
@@ -125,6 +131,23 @@ class Executor:
         if gain is not None:
             gain.learn(durations_ns, perf_counter_ns() - start_ns, side_by_side)
         return side_by_side, None
+
+    def go_on(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> BaseException | None:
+        """Run the steps that a compiled run has not come to, which ended with NothingGiven.
+
+        Returns
+        -------
+        BaseException or None
+            As ``execute`` does.
+        """
+        self._program.running.add(tokens)
+        try:
+            go_on_one_by_one(tokens, wanted, durations_ns)
+        except BaseException as error:
+            return error
+        finally:
+            self._program.running.discard(tokens)
+        return None
 
     def _find(
         self, key: Hashable, tokens: TokenManager, wanted: bytes | None, plain: frozenset[str], changed: tuple[str, ...]
@@ -172,6 +195,8 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
     ------
     OutputArityError
         The function returned the wrong number of values.
+    NothingGiven
+        An input is Nothing, so the function was not called.
     ContractBroken, InputMutated, IteratorRefused
         It does not keep to its contract, changed an object inside an input, or returned what can be read only once.
     """
@@ -202,6 +227,8 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
             made = (keep(result, FRESH, program, outputs[0], values),)
         if contracts is not None:
             _check(program, step, contracts[1], outputs, made)
+    except NothingGiven:
+        raise
     except BaseException:
         durations_ns[place] = perf_counter_ns() - start_ns if start_ns else 0
         raise
@@ -211,6 +238,9 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
 def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
     """Return the inputs of a step that is not plain; a switch passes values on as they are stored."""
     args = [values[slot] for slot in step.inputs]
+    for arg in args if step.switch is None else (values[slot] for slot in program.read_by(step, values)):
+        if arg is Nothing:
+            raise NothingGiven
     if program.guard and step.switch is None:
         args = [writable(arg) if step.unguarded else lend(arg) for arg in args]
     if step.contracts is not None:
@@ -242,13 +272,13 @@ def _check(
 ) -> None:
     """Raise ContractBroken for the first value that is not the image that the function's annotation says."""
     for contract, slot, value in zip(contracts, slots, values, strict=False):
-        found = contract.found(value) if contract is not None else None
+        found = contract.found(value) if contract is not None and value is not Nothing else None
         if contract is not None and found is not None:
             raise ContractBroken(step.name, program.tokens[slot], contract, found, made=slots is step.outputs)
 
 
 def unpack(program: Program, step: Step, result: Any, values: Sequence[Any]) -> list[Any]:
-    """Return a result as one value per output token, guarded; a string or an array is not split.
+    """Return a result as one value per output token, guarded; a string or an array is not split, Nothing is for all.
 
     Raises
     ------
@@ -270,6 +300,8 @@ def unpack(program: Program, step: Step, result: Any, values: Sequence[Any]) -> 
             slots = iter(step.outputs)
             return [keep(item, fresh_count, program, next(slots), values) for item in found]
         got = f"{type(result).__name__} of {len(found)}"
+    elif result is Nothing:
+        return [Nothing] * len(step.outputs)
     raise OutputArityError(step.name, [program.tokens[slot] for slot in step.outputs], got)
 
 
@@ -286,8 +318,23 @@ def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dic
         if wanted is None or wanted[place]:
             tokens.running = place
             step = steps[place]
-            store(step, call(program, step, values, durations_ns))
+            try:
+                made = call(program, step, values, durations_ns)
+            except NothingGiven:
+                tokens.skip(step)
+            else:
+                store(step, made)
         place = next_dirty(1, place + 1)
+
+
+def go_on_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
+    """Run the dirty steps that a compiled run has not come to, which ended with NothingGiven."""
+    if tokens.origin is None:
+        tokens.dirty = bytearray(place not in durations_ns for place in range(len(tokens.dirty)))
+    else:
+        # What was new to any step is not known: a compiled run does not write it down.
+        tokens.origin = b"\1" * len(tokens.dirty)
+    run_one_by_one(tokens, wanted, durations_ns)
 
 
 # -- compiled ---------------------------------------------------------------------------------------------------------
@@ -305,6 +352,8 @@ _NAMES: Final = {
     "call": call,
     "unpack": unpack,
     "is_unchanged": is_unchanged,
+    "Nothing": Nothing,
+    "NothingGiven": NothingGiven,
 }
 _FREQUENT: Final = ("clock", "kind", "count", "array", "HARMLESS")
 
@@ -432,6 +481,9 @@ class _Source:
             yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(program, steps[{step.place}], v, d)"
             return
         args = [f"v[{slot}]" for slot in step.inputs]
+        if not program.guard and (asked := [slot for slot in step.inputs if slot not in self._plain]):
+            # Nothing else looks at the inputs.
+            yield f"if {' or '.join(f'v[{slot}] is Nothing' for slot in asked)}: start = 0; raise NothingGiven"
         for place, slot in enumerate(step.inputs):
             if self._is_lent_first(step, slot) and step.inputs.index(slot) == place:
                 args[place] = f"s{step.place}_{slot}"
@@ -544,7 +596,8 @@ class SideBySide:
         program, values = tokens.program, tokens.values
         self._tokens, self._durations_ns, self._workers = tokens, durations_ns, workers
         self._before = values.copy(), tokens.dirty.copy()
-        self._made: dict[int, Sequence[Any]] = {}
+        # What each step has made; None if it was skipped.
+        self._made: dict[int, Sequence[Any] | None] = {}
         self._failures: dict[int, BaseException] = {}
         self._calls: set[int] = set()
         self._is_over = False
@@ -577,11 +630,14 @@ class SideBySide:
         if self._failures:
             failed_at = min(self._failures)
             tokens.values[:], tokens.dirty[:] = self._before
-            for place in sorted(self._made):
-                if place < failed_at:
-                    tokens.store(tokens.program.steps[place], self._made[place])
+            for place, made in sorted(self._made.items()):
+                step = tokens.program.steps[place]
+                if place > failed_at:
+                    self._durations_ns.pop(place, None)
+                elif made is None:
+                    tokens.skip(step)
                 else:
-                    del self._durations_ns[place]
+                    tokens.store(step, made)
             for place in self._failures:
                 if place != failed_at:
                     del self._durations_ns[place]
@@ -605,12 +661,14 @@ class SideBySide:
         program, mark = tokens.program, _Call(place)
         step = program.steps[place]
         failure: BaseException | None = None
-        made: Sequence[Any] = ()
+        made: Sequence[Any] | None = None
         self._calls.add(place)
         program.running.add(mark)
         self._changed.release()
         try:
             made = call(program, step, tokens.values, self._durations_ns)
+        except NothingGiven:
+            pass
         except BaseException as exception:
             failure = exception
         finally:
@@ -621,7 +679,10 @@ class SideBySide:
         self._calls.discard(place)
         if failure is None:
             self._made[place] = made
-            tokens.store(step, made)
+            if made is None:
+                tokens.skip(step)
+            else:
+                tokens.store(step, made)
             self._release(place)
         else:
             self._failures[place] = failure

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph import CompGraph, redefined
+from epypes.nothing import Nothing
 from epypes.rich_display import mimebundle
 from epypes.run.failure import Failure
-from epypes.run.guard import ARRAYLESS, lend
+from epypes.run.guard import READ_AS_STORED, lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.program import Program
-from epypes.run.staleness import NOT_COMPUTED, TokenManager
+from epypes.run.staleness import NOT_COMPUTED, TokenManager, skipped_steps
 from epypes.run.timing import RunReport, Times
 from epypes.wording import counted
 
@@ -111,7 +112,7 @@ class Run(TokenMapping):
         slot = hparams.program.slots.get(token)
         if slot is not None and has_payload and 1 not in dirty:
             value = values[slot]
-            return value if type(value) in ARRAYLESS or not hparams.program.guard else lend(value)
+            return value if type(value) in READ_AS_STORED or not hparams.program.guard else lend(value)
         try:
             return self.tokens.read(token)
         except StaleToken:
@@ -174,7 +175,7 @@ class RunImporter:
             Of the function that failed, if one did.
         """
         program, first = self._program, first_hyperparameters or {}
-        slots = [NOT_COMPUTED] * len(program.tokens)
+        slots: list[Any] = [NOT_COMPUTED] * len(program.tokens)
         for token, value in {**tokens, **hyperparameters}.items():
             if token in program.slots:
                 slots[program.slots[token]] = value
@@ -183,7 +184,8 @@ class RunImporter:
         known = durations_ns or {}
         by_step = {step.place: known[step.name] for step in program.steps if step.name in known}
         failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
-        times = (program, None, by_step, total_ns, False, failed_at)
+        program.has_skipped = any(value is Nothing for value in slots)
+        times = (program, None, by_step, total_ns, False, failed_at, skipped_steps(program, slots, program.clean))
         hparams = Hyperparameters(program, entries, revision)
         return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
 

@@ -12,14 +12,15 @@ from weakref import ref
 
 from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
+from epypes.nothing import NothingGiven
 from epypes.run.execute import CompiledRun, Executor
 from epypes.run.failure import failure_of
-from epypes.run.guard import COPIERS, lend, require_reusable
+from epypes.run.guard import COPIERS, lend_to_reader, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
 from epypes.run.result import Run, TokenMapping, TrialOf, new_run
-from epypes.run.staleness import TokenManager
+from epypes.run.staleness import TokenManager, skipped_steps
 from epypes.run.timing import Reports
 from epypes.wording import counted
 
@@ -247,10 +248,18 @@ class CompGraphRunner(TokenMapping):
             self._wanted[tuple(targets)] = wanted
         durations_ns: dict[int, int] = {}
         side_by_side, error = self._executor.execute(tokens, wanted, durations_ns, hparams.plain, changed)
+        return self._ended(tokens, hparams, wanted, durations_ns, start_ns, trial_of, error, side_by_side)
+
+    def _ended(
+        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: dict[int, int],
+        start_ns: int, trial_of: TrialOf | None, error: BaseException | None, side_by_side: bool = False,
+    ) -> Run:  # fmt: skip
+        """Record the run that has left these tokens, and end it; ``error`` is what the running step raised."""
         if error is not None:
             run = self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error, side_by_side)
         else:
-            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1
+            program, skipped = self._program, skipped_steps(self._program, tokens.values, tokens.dirty)
+            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1, skipped
             program.note_calls(durations_ns)
             dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
             run = Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, None))
@@ -276,10 +285,13 @@ class CompGraphRunner(TokenMapping):
         if error is not None:
             tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
-            return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+            if isinstance(error, NothingGiven):
+                error = self._executor.go_on(tokens, wanted, durations_ns)
+            return self._ended(tokens, hparams, wanted, durations_ns, start_ns, trial_of, error)
         # Without targets everything is up to date then.
         left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
+        skipped = skipped_steps(program, values, left_dirty) if program.has_skipped else ()
+        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1, skipped
         run.record = values, left_dirty, True, revisions, hparams, times, None
         if (uncounted := program.uncounted) is not None:
             uncounted.append(durations_ns)
@@ -312,7 +324,8 @@ class CompGraphRunner(TokenMapping):
         reached = bytearray(wanted or b"\1" * len(program.steps))
         for place in tokens.stale:
             reached[place] = 0
-        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at
+        skipped = skipped_steps(program, tokens.values, tokens.dirty)
+        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at, skipped
         dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
         return Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, failure))
 
@@ -516,7 +529,7 @@ class CompGraphRunner(TokenMapping):
         hparams, last = self._state
         if token in hparams.entries:
             value = hparams.entries[token][0]
-            return lend(value) if self.guard else value
+            return lend_to_reader(value) if self.guard else value
         if last is None:
             self.cg.require_token(token)
             text = f"Token {token!r} has not been computed: nothing has been run. Call {run_call(hparams.free_slots)}."
@@ -592,7 +605,7 @@ def stop_at(
         durations_ns = {}
     wanted = bytes(len(program.steps))
     if function is None or why is None:
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1, ()
         run = Run((tokens.values, bytes(tokens.dirty), tokens.has_payload, tokens.revisions, hparams, times, None))
     else:
         tokens.running = next(step.place for step in program.steps if step.name == function)
