@@ -62,8 +62,8 @@ def encode(
     ----------
     envelope
         The message to send. Its values are None, Nothing, bool, int, float, complex, str, bytes, list, tuple, dict,
-        set, frozenset, numpy arrays and scalars, OpenCV's KeyPoint and DMatch, DataFrames and Series of pandas, nested in
-        any way.
+        set, frozenset, arrays and scalars of numpy, KeyPoint and DMatch of OpenCV, DataFrames and Series of pandas, in
+        any nesting.
     topic
         The first frame, see `topic_frame`.
     inline_below
