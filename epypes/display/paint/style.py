@@ -24,10 +24,6 @@ _COLOURS: Final = {
     "alarm": ("#fcebec", "color-mix(in srgb,@error 10%,@ground)"),
 }
 
-# Of what takes no part in a run: a branch that is not chosen, what is skipped.
-_FAINT_SHAPE: Final = "fill:@ground;stroke:@line;stroke-dasharray:1 4"
-_FAINT_TEXT: Final = "fill:@quiet;font-weight:400"
-
 # Selector -> declarations. The rule of a state stands after that of a kind.
 _RULES: Final = {
     "": "max-width:100%;height:auto;font:12px var(--jp-ui-font-family,system-ui,sans-serif)",
@@ -48,12 +44,8 @@ _RULES: Final = {
     " .stale .shape": "fill:@ground;stroke-dasharray:2 3",
     " .not-computed .shape": "stroke-dasharray:2 3",
     " .not-run .shape": "stroke-dasharray:2 3",
-    " .left-out .shape": _FAINT_SHAPE,
-    " .left-out text": _FAINT_TEXT,
-    " .skipped .shape": _FAINT_SHAPE,
-    " .skipped text": _FAINT_TEXT,
-    " .nothing-found .shape": _FAINT_SHAPE,
-    " .nothing-found text": _FAINT_TEXT,
+    " .left-out .shape": "fill:@ground;stroke:@line;stroke-dasharray:1 4",
+    " .left-out text": "fill:@quiet;font-weight:400",
     " .running .shape": "stroke:@good;stroke-width:2.5",
     " .reused .shape": "stroke-dasharray:9 2",
     " .stopped .shape": "stroke-dasharray:2 3",
