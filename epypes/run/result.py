@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,7 +14,7 @@ from epypes.run.failure import Failure
 from epypes.run.guard import READ_AS_STORED, lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.program import Program
-from epypes.run.staleness import NOT_COMPUTED, TokenManager, skipped_steps
+from epypes.run.staleness import NOT_COMPUTED, TokenManager
 from epypes.run.timing import RunReport, Times
 from epypes.wording import counted
 
@@ -184,10 +184,22 @@ class RunImporter:
         known = durations_ns or {}
         by_step = {step.place: known[step.name] for step in program.steps if step.name in known}
         failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
-        program.has_skipped = any(value is Nothing for value in slots)
-        times = (program, None, by_step, total_ns, False, failed_at, skipped_steps(program, slots, program.clean))
+        skipped = tuple(self._skip(slots, by_step))
+        times = (program, None, by_step, total_ns, False, failed_at, skipped)
         hparams = Hyperparameters(program, entries, revision)
         return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
+
+
+    def _skip(self, slots: list[Any], ran: Container[int]) -> Iterator[int]:
+        """Give the steps that were skipped, as far as the tokens say, whose outputs become Nothing."""
+        program = self._program
+        for step in program.steps:
+            seen = [slots[slot] is Nothing for slot in (*program.read_by(step, slots), *step.outputs)]
+            if step.place not in ran and any(seen):
+                program.has_skipped = True
+                for slot in step.outputs:
+                    slots[slot] = Nothing
+                yield step.place
 
 
 # Half the time of Run(...).

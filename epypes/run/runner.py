@@ -283,7 +283,8 @@ class CompGraphRunner(TokenMapping):
         finally:
             program.running.discard(run)
         if error is not None:
-            tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
+            left = bytearray(b"\1") * len(program.steps) if dirty is None else dirty
+            tokens = TokenManager.of_run(program, values, left, True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
             if isinstance(error, NothingGiven):
                 error = self._executor.go_on(tokens, wanted, durations_ns)
@@ -317,7 +318,7 @@ class CompGraphRunner(TokenMapping):
         durations_ns.setdefault(failed_at, 0)
         program.note_calls(durations_ns)
         if tokens.origin is None:
-            tokens.dirty = bytearray(step.place not in durations_ns for step in program.steps)
+            tokens.dirty = bytearray(left and place not in durations_ns for place, left in enumerate(tokens.dirty))
         failure = failure_of(tokens, failed_at, error)
         tokens.forget(program.downstream([failed_at], tokens.values))
         # Of the steps that were not reached none was reused.
