@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
@@ -11,9 +12,9 @@ from epypes.graph import CompGraph, redefined
 from epypes.nothing import Nothing
 from epypes.rich_display import mimebundle
 from epypes.run.failure import Failure
-from epypes.run.guard import READ_AS_STORED, lend
+from epypes.run.guard import READ_AS_STORED, lend, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.program import Program
+from epypes.run.program import Program, StateSlots
 from epypes.run.staleness import NOT_COMPUTED, TokenManager
 from epypes.run.timing import RunReport, Times
 from epypes.wording import counted
@@ -88,6 +89,29 @@ class Run(TokenMapping):
     def revision(self) -> int:
         """The runner's count of hyperparameter changes when the run began."""
         return self.record[4].revision
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """What the next run begins with, by delayed token; see ``ep.delay``.
+
+        Of a failed run, and where nothing was found, it is what the run began with.
+        """
+        states, guard = self.record[4].program.states, self.record[4].program.guard
+        values = zip(states, self.state_after(), strict=True)
+        known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
+        return MappingProxyType({key: lend_to_reader(value) if guard else value for key, value in known.items()})
+
+    def state_after(self) -> tuple[Any, ...]:
+        """Return the values of ``state`` as they are stored, in the order of the program's states."""
+        values, *_, failure = self.record
+        program, stale = self.record[4].program, self.tokens.stale
+
+        def value_after(slots: StateSlots) -> Any:
+            after = values[slots.after]
+            is_kept = failure or after is NOT_COMPUTED or after is Nothing or program.makers[slots.after] in stale
+            return values[slots.before] if is_kept else after
+
+        return tuple(map(value_after, program.states))
 
     @property
     def cg(self) -> CompGraph:
@@ -188,7 +212,6 @@ class RunImporter:
         times = (program, None, by_step, total_ns, False, failed_at, skipped)
         hparams = Hyperparameters(program, entries, revision)
         return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
-
 
     def _skip(self, slots: list[Any], ran: Container[int]) -> Iterator[int]:
         """Give the steps that were skipped, as far as the tokens say, whose outputs become Nothing."""

@@ -194,12 +194,13 @@ class TokenManager:
 
     def lacking(self) -> dict[str, tuple[str, ...]]:
         """Return by function, of those that read a token whose value is Nothing, these tokens."""
-        program = self.program
-        read = {
-            step.name: map(program.tokens.__getitem__, program.read_by(step, self.values)) for step in program.steps
-        }
-        found = {name: tuple(dict.fromkeys(filter(self.is_nothing, tokens))) for name, tokens in read.items()}
-        return {name: tokens for name, tokens in found.items() if tokens}
+        program, values = self.program, self.values
+        found: dict[str, tuple[str, ...]] = {}
+        for step in program.steps:
+            slots = [slot for slot in dict.fromkeys(program.read_by(step, values)) if values[slot] is Nothing]
+            if slots:
+                found[step.name] = tuple(program.tokens[slot] for slot in slots)
+        return found
 
     def is_stale(self, token: str) -> bool:
         """Whether the token has a value that is out of date."""
@@ -244,7 +245,7 @@ class TokenManager:
         return self.program.cg.has_token(token) and self.is_readable(token)
 
     def __iter__(self) -> Iterator[str]:
-        return (token for token in self.program.tokens if self.is_readable(token))
+        return (token for token in self.program.cg.tokens if self.is_readable(token))
 
 
 def skipped_steps(program: Program, values: Sequence[Any], dirty: Sequence[int]) -> tuple[int, ...]:

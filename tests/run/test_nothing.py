@@ -267,6 +267,24 @@ def test_a_pipeline_in_a_graph_passes_on_what_it_has_not_found(way):
         assert runner.run(x=ep.Nothing).report.skipped == ("inner", "after", "next")
 
 
+def test_state_between_runs_stays_where_nothing_was_found(way):
+    """So a track that was lost goes on from the last place where it was seen."""
+    cg = ep.CompGraph(
+        {"find": lambda x: x if x else ep.Nothing, "smooth": lambda place, before: (place + before) / 2},
+        {"find": ("x", "place"), "smooth": (("place", "before"), "smoothed")},
+    )
+    inner = ep.delay(cg, "smoothed", "before", initial=0)
+    outer = ep.CompGraph({"track": ep.Pipeline("track", inner), "end": abs}, {"track": ("x", "y"), "end": ("y", "z")})
+    for graph, token, key in ((inner, "smoothed", "before"), (outer, "z", "track.before")):
+        runner = way.runner(graph)
+        for _ in range(way.runs):
+            runner.reset()
+            assert [runner.run(x=x)[token] for x in (8, 0, 0, 6)] == [4, ep.Nothing, ep.Nothing, 5]
+            assert runner.run(x=0).state == runner.state == {key: 5}
+        assert runner.run(x=ep.Nothing)[token] is ep.Nothing
+        assert runner.state == {key: 5}
+
+
 def test_a_trial_is_skipped_as_a_rerun_is():
     graph = Search()
     runner = ep.CompGraphRunner(graph.cg, graph.hparams)
