@@ -104,14 +104,14 @@ class Run(TokenMapping):
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
         values, *_, failure = self.record
-        program, stale = self.record[4].program, self.tokens.stale
 
         def value_after(slots: StateSlots) -> Any:
             after = values[slots.after]
-            is_kept = failure or after is NOT_COMPUTED or after is Nothing or program.makers[slots.after] in stale
+            # Of a rerun for other targets the value may be stale: it is still what the frame has left.
+            is_kept = failure or after is NOT_COMPUTED or after is Nothing
             return values[slots.before] if is_kept else after
 
-        return tuple(map(value_after, program.states))
+        return tuple(map(value_after, self.record[4].program.states))
 
     @property
     def cg(self) -> CompGraph:
