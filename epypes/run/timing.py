@@ -33,7 +33,7 @@ Times = tuple[Program, bytes | None, Durations, int, bool, int, tuple[int, ...]]
 KEPT: Final = 1_000
 # Packed above that: a thousand reports would hold a gigabyte of integers.
 _MAX_UNPACKED: Final = 400
-_COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed")
+_COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed", "skipped")
 _SUMMARY_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
 _STANDARD: Final = NormalDist()
 # Fewer durations say nothing of the tails: two that differ by a factor of 3 would get a range of a factor of 6.
@@ -170,7 +170,7 @@ class RunReport:
         return self.total_ns - sum(self.ran_ns.values())
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table: function, ran, time_ms, share (of the total), failed.
+        """Return a table: function, ran, time_ms, share (of the total), failed, skipped.
 
         A function that failed has ``ran`` true as well, and the time until it raised.
         """
@@ -179,12 +179,12 @@ class RunReport:
 
         return pd.DataFrame(self._rows(), columns=list(_COLUMNS))
 
-    def _rows(self) -> list[tuple[str, bool, float, float, bool]]:
+    def _rows(self) -> list[tuple[str, bool, float, float, bool, bool]]:
         """Return what ``to_frame`` has as rows."""
         total_ns = max(self.total_ns, 1)
         return [
-            (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / total_ns, entry.failed)
-            for entry in self.functions
+            (each.function, each.ran, each.duration_ns / 1e6, each.duration_ns / total_ns, each.failed, each.skipped)
+            for each in self.functions
         ]
 
     def __repr__(self) -> str:
@@ -230,7 +230,7 @@ class Reports(Sequence[RunReport]):
         return len(self.kept)
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total), failed."""
+        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of the run), failed, skipped."""
         with optional_import():
             import pandas as pd
 

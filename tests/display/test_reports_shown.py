@@ -239,7 +239,7 @@ def test_reports_become_a_table_of_one_row_per_run_and_function():
     runner = ep.CompGraphRunner(
         ep.CompGraph({"f": abs, "g": lambda y, k: y}, {"f": ("x", "y"), "g": (("y", "k"), "z")}), {"k": 1}
     )
-    columns = ["run", "function", "ran", "time_ms", "share", "failed"]
+    columns = ["run", "function", "ran", "time_ms", "share", "failed", "skipped"]
     assert list(runner.reports.to_frame().columns) == columns
     assert len(runner.reports.to_frame()) == 0
     runner.run(x=1)
@@ -322,4 +322,4 @@ def test_a_report_says_which_functions_were_skipped():
     assert "1 function ran, 0 reused, 1 skipped" in mimebundle(report)["text/html"]
     assert [line.split()[:2] for line in str(report).splitlines() if line.startswith("mark")] == [["mark", "skipped"]]
     row = report.to_frame().set_index("function").loc["mark"]
-    assert (bool(row["ran"]), float(row["time_ms"]), bool(row["failed"])) == (False, 0.0, False)
+    assert (bool(row["ran"]), float(row["time_ms"]), bool(row["skipped"])) == (False, 0.0, True)
