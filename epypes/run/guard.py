@@ -247,8 +247,6 @@ def keep(value: Any, fresh_count: int, program: Program, slot: int, values: Sequ
         return value
     if is_array(value):
         return _locked(value.copy() if hasattr(value, "mask") else _own(value, is_known, program, slot, values))
-    if value is Nothing:
-        return value
     if kind not in COPIERS:
         require_reusable(value, program, slot)
     copier = COPIERS[kind] if kind in COPIERS else _learn(kind)

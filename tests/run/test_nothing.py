@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import threading
 from typing import Annotated
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 
 import epypes as ep
 from epypes.errors import GraphError, InputMutated, OutputArityError, UnknownName
+
+TIMEOUT_S = 60.0
 
 
 class Search:
@@ -226,6 +229,28 @@ def test_a_function_that_fails_beside_skipped_ones_leaves_the_run_as_any_failure
         assert (runner.last.failure.function, runner["z"], set(runner.last)) == ("fail", ep.Nothing, {"x", "y", "z"})
         assert runner.last.report.skipped == ("skip",)
         assert runner.run(x=1)["v"] == 1
+
+
+def test_what_was_skipped_behind_a_function_that_fails_leaves_no_trace(way):
+    """Side by side it is skipped before the other fails."""
+    passed = threading.Event()
+
+    def fail(x):
+        assert way.name != "side by side" or passed.wait(TIMEOUT_S)
+        return 1 // x
+
+    cg = ep.CompGraph(
+        {"find": lambda x: ep.Nothing, "fail": fail, "skip": abs, "tell": lambda x: passed.set()},
+        {"find": ("x", "y"), "fail": ("x", "w"), "skip": ("y", "z"), "tell": ("x", None)},
+    )
+    runner = way.runner(cg)
+    for _ in range(way.runs):
+        runner.run(x=1)
+        passed.clear()
+        with pytest.raises(ZeroDivisionError):
+            runner.run(x=0)
+        assert (set(runner.last), runner.last.report.ran) == ({"x", "y"}, ("find", "fail"))
+        assert (runner.last.report.skipped, runner.stale) == ((), ("fail", "skip", "tell"))
 
 
 def test_an_array_that_is_passed_through_counts_as_new_after_a_compiled_run_has_met_nothing(way):
