@@ -18,7 +18,6 @@ from epypes.cli.bundles import run_promotion
 from epypes.cli.options import PATH, allow_option, bundle_argument, keys_option, seconds_option
 from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError, UnknownName
-from epypes.nothing import Nothing
 
 if TYPE_CHECKING:
     from epypes.images import Order
@@ -58,6 +57,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     from epypes.bundle.manifest import SETTINGS, check_manifest
     from epypes.bundle.settings import read_settings
     from epypes.display.previews.preview import preview
+    from epypes.nothing import Nothing
     from epypes.service import Client
 
     check_manifest(bundle)
