@@ -19,7 +19,7 @@ from time import perf_counter_ns
 from types import BuiltinFunctionType
 from typing import Any, Final
 
-from epypes.nothing import Nothing, NothingGiven
+from epypes.nothing import Nothing, NothingGiven, NothingType
 from epypes.run.call import call, unpack
 from epypes.run.guard import (
     ARRAYLESS,
@@ -110,18 +110,21 @@ class Executor:
             if side_by_side:
                 SideBySide(tokens, wanted, durations_ns, self._workers).run()
             elif (compiled := self._find(key, tokens, wanted, plain, changed)) is not None:
+                is_whole = True
                 try:
                     compiled(tokens, tokens.values, tokens.dirty, durations_ns)
                 except NothingGiven:
+                    is_whole = False
+                # Outside, so that what a function raises has no context.
+                if not is_whole:
                     go_on_one_by_one(tokens, wanted, durations_ns)
-                else:
-                    if tokens.origin is None:
-                        left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
-                        tokens.dirty = bytearray(left_out)
+                elif tokens.origin is None:
+                    left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
+                    tokens.dirty = bytearray(left_out)
             else:
                 run_one_by_one(tokens, wanted, durations_ns)
                 if len(self._program.steps) <= _MAX_STEPS:
-                    self._kinds = [*map(type, tokens.values)]
+                    self._kinds = self._guessed(tokens.values)
         except BaseException as error:
             return side_by_side, error
         finally:
@@ -129,6 +132,13 @@ class Executor:
         if gain is not None:
             gain.learn(durations_ns, perf_counter_ns() - start_ns, side_by_side)
         return side_by_side, None
+
+    def _guessed(self, values: Sequence[Any]) -> list[type]:
+        """Return the types of values by slot; of one that is Nothing now, the type that it had before."""
+        kinds = [*map(type, values)]
+        if not (self._program.has_skipped and self._kinds):
+            return kinds
+        return [before if kind is NothingType else kind for before, kind in zip(self._kinds, kinds, strict=True)]
 
     def go_on(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> BaseException | None:
         """Run the steps that a compiled run has not come to, which ended with NothingGiven.

@@ -224,8 +224,9 @@ def test_a_function_that_fails_beside_skipped_ones_leaves_the_run_as_any_failure
     for x in range(1, 1 + way.runs):
         runner.run(x=x)
     for _ in range(way.runs):
-        with pytest.raises(ZeroDivisionError):
+        with pytest.raises(ZeroDivisionError) as error:
             runner.run(x=0)
+        assert (error.value.__context__, error.value.__cause__) == (None, None)
         assert (runner.last.failure.function, runner["z"], set(runner.last)) == ("fail", ep.Nothing, {"x", "y", "z"})
         assert runner.last.report.skipped == ("skip",)
         assert runner.run(x=1)["v"] == 1
