@@ -6,7 +6,8 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``errors``: every error EPypes raises; ``optional``: which extra brings a package that is missing;
   ``rich_display``: the registry that objects ask for their picture
 - ``annotations``: what a function's annotations say, once evaluated
-- ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images
+- ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images;
+  ``nothing``: the value of a token for which nothing was found
 - ``graph``: what is connected to what
 - ``parameters``: which values the functions of OpenCV and scikit-image take
 - ``run``: which functions must run, and running them
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     )
     from epypes.hints import Param, Roi
     from epypes.images import Image
+    from epypes.nothing import Nothing, NothingType
     from epypes.pipeline import (
         EventLoop,
         EventView,
@@ -112,6 +114,8 @@ _HOMES = {
     "FullPipeline": "epypes.pipeline",
     "Image": "epypes.images",
     "Mailbox": "epypes.pipeline",
+    "Nothing": "epypes.nothing",
+    "NothingType": "epypes.nothing",
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
     "Case": "epypes.batch.cases",
@@ -163,6 +167,8 @@ __all__ = [
     "MapResult",
     "Node",
     "NodeBasedCompGraph",
+    "Nothing",
+    "NothingType",
     "Param",
     "Pipeline",
     "Placeholder",

@@ -30,6 +30,7 @@ from epypes.bundle.compare import first_difference
 from epypes.bundle.settings import Member
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
+from epypes.nothing import Nothing
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 
@@ -317,8 +318,11 @@ def _measured(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Chec
     elif check is not _RUNS:
         try:
             value, expected = _compared(outcome, check, cg)
-            number = _number(_measure(outcome, case, check, cg, value, expected), check)
-            reason = _shortfall(number, check, value, expected)
+            if value is Nothing and not (callable(check.metric) or METRICS[check.metric].measures_nothing):
+                reason = f"nothing was found of {check.token!r}"
+            else:
+                number = _number(_measure(outcome, case, check, cg, value, expected), check)
+                reason = _shortfall(number, check, value, expected)
         except (Exception, SystemExit) as error:  # whatever a user's metric raises
             number, error_info, reason = None, *_failure(error, check)
     pictures: dict[str, Thumbnail] = {}

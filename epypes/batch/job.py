@@ -119,18 +119,20 @@ def _outcome(
             return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, error_info=info)
         run = runner.last
     report, tokens, failure = run.report, run.tokens, run.failure
+    sinks = [token for token in run.cg.sink_tokens if tokens.is_readable(token)]
     thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
         item.number,
         item.name,
         setting,
-        {token: short_value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
+        {token: short_value(run[token]) for token in sinks if not tokens.is_nothing(token)},
         report.durations_ns,
         report.total_ns,
         None if failure is None else ErrorInfo(failure.function, failure.kind, failure.message),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
+        tuple(filter(tokens.is_nothing, sinks)),
     )
 
 

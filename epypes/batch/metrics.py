@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from epypes.nothing import Nothing
 from epypes.optional import optional_import
 
 with optional_import("scale"):
@@ -36,12 +37,15 @@ class Metric:
         Which numbers are better; None if that is for the threshold to say.
     least
         What the number must be at least where no threshold is given; None if one must be given.
+    measures_nothing
+        Whether it takes Nothing. Where it does not, a check falls short if nothing was found.
     """
 
     function: Callable[..., float]
     compares: bool = True
     better: Literal["greater", "less"] | None = "greater"
     least: float | None = None
+    measures_nothing: bool = False
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -129,7 +133,7 @@ def count(value: Any, *, of: Literal["items", "nonzero", "labels"] | None = None
     Parameters
     ----------
     value
-        A sequence, a table or an array.
+        A sequence, a table or an array; of Nothing there are 0.
     of
         ``"items"``: what ``len`` counts, rows of an array; ``"nonzero"``: pixels that are not zero; ``"labels"``:
         different numbers in a label image but 0. Without: the items, of a mask (bool) the pixels that are True. Other
@@ -140,6 +144,8 @@ def count(value: Any, *, of: Literal["items", "nonzero", "labels"] | None = None
     ValueError
         The value can't be counted, or in more than one way.
     """
+    if value is Nothing:
+        return 0.0
     if of == "nonzero":
         return float(np.count_nonzero(value))
     if of == "labels":
@@ -220,10 +226,10 @@ def psnr(value: Any, expected: Any, *, data_range: float | None = None) -> float
 
 
 METRICS: Final[Mapping[str, Metric]] = {
-    "equal": Metric(equal, least=1.0),
+    "equal": Metric(equal, least=1.0, measures_nothing=True),
     "close": Metric(close, least=1.0),
     "iou": Metric(iou),
-    "count": Metric(count, compares=False, better=None),
+    "count": Metric(count, compares=False, better=None, measures_nothing=True),
     "value": Metric(value, compares=False, better=None),
     "mean_abs_difference": Metric(mean_abs_difference, better="less"),
     "psnr": Metric(psnr),

@@ -31,6 +31,7 @@ from epypes.batch.results import Outcome, frame_of, html_table, object_column, v
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
 from epypes.display.text import content, cut, cut_name, escape
 from epypes.errors import ScaleError
+from epypes.nothing import Nothing
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
@@ -488,6 +489,8 @@ class _Objective:
             given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
         except (Exception, SystemExit) as error:
             return math.nan, f"{self.name} raised {type(error).__name__}: {error}"
+        if given is Nothing:
+            return math.nan, f"{self.name} gave Nothing: nothing was found"
         try:
             value = float(given)
         except (TypeError, ValueError, OverflowError):

@@ -18,6 +18,7 @@ from epypes.display.previews.short import float_text
 from epypes.display.text import content, duration_text, escape, fitted
 from epypes.errors import ImageFileError, ScaleError
 from epypes.graph import CompGraph
+from epypes.nothing import Nothing
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ class Outcome:
     setting
         The hyperparameters that were varied, by token; nothing in a map.
     values
-        By sink token: a number, text or truth value as it is, of anything else a short text.
+        By sink token: a number, text or truth value as it is, of anything else a short text. Those of ``nothing`` are
+        not among them.
     times_ns
         Nanoseconds by function that ran; what was reused from the setting before is not among them.
     total_ns
@@ -82,6 +84,8 @@ class Outcome:
         Whole values by token, if they were asked for.
     texts
         Of tokens whose thumbnails were asked for and that have no picture: a text instead.
+    nothing
+        The sink tokens whose value is Nothing; their cells of a table are empty.
     """
 
     number: int
@@ -94,6 +98,7 @@ class Outcome:
     thumbnails: Mapping[str, Thumbnail] = field(default_factory=dict)
     kept: Mapping[str, Any] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
+    nothing: tuple[str, ...] = ()
 
     @property
     def has_failed(self) -> bool:
@@ -118,7 +123,7 @@ class Outcome:
         }
         error_info = None if info is None else ErrorInfo(**info)
         found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting)
-        return replace(found, error_info=error_info, thumbnails=thumbnails)
+        return replace(found, error_info=error_info, thumbnails=thumbnails, nothing=tuple(found.nothing))
 
 
 class OutcomeSequence(Sequence[Outcome]):
@@ -188,6 +193,7 @@ def outcomes_frame(
     pandas.DataFrame
         ``name``, the extra columns, ``failure`` (None, or what failed), one column per sink token, ``total_ms``, and
         ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
+        Where nothing was found, or the run failed, the cell of the token is empty: None, NaN or NA.
     """
     columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
     columns |= {column: object_column(values) for column, values in extra.items()}
@@ -303,13 +309,19 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
         [
             outcome.name,
             *(outcome.thumbnails.get(token) for token in shown),
-            *(value_text(outcome.values[token]) if token in outcome.values else "" for token in sinks),
+            *(_cell_text(outcome, token) for token in sinks),
             duration_text(outcome.total_ns),
         ]
         for outcome in outcomes
     ]
     failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
     return html_table(caption, ["name", *shown, *sinks, "time"], rows, failures)
+
+
+def _cell_text(outcome: Outcome, token: str) -> str:
+    if token in outcome.nothing:
+        return short_text(Nothing)
+    return value_text(outcome.values[token]) if token in outcome.values else ""
 
 
 def value_text(value: Any) -> str:

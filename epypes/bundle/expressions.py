@@ -23,6 +23,7 @@ from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, Union, get_origin
 
 from epypes.bundle.resolve import Importable, Refused, importable
+from epypes.nothing import Nothing
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
@@ -238,6 +239,8 @@ class _Writer:
             return f"{annotated}[{self._joined((value.__origin__, *value.__metadata__))}]"
         if value is ...:
             return "..."
+        if value is Nothing:
+            return gathered.reference(Importable("epypes", "Nothing"), what)
         if isinstance(value, types.UnionType):
             return " | ".join(map(self.write, value.__args__))
         if isinstance(value, types.GenericAlias) or (get_origin(value) is Union and type(value).__module__ == "typing"):

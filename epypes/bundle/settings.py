@@ -24,6 +24,7 @@ from epypes.errors import BundleError
 from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes.images import Order
+from epypes.nothing import Nothing
 from epypes.optional import optional_import
 from epypes.run.guard import is_plain_array
 
@@ -309,6 +310,8 @@ def _encode(value: Any) -> dict[str, Any]:
     kind = type(value)
     if value is None:
         return {_KIND: "none"}
+    if value is Nothing:
+        return {_KIND: "nothing"}
     if kind in (bool, float) or (kind is int and value in _SMALL):
         return {"value": value}
     if kind is str:
@@ -422,6 +425,8 @@ def decode_value(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = Non
     kind = entry.get(_KIND)
     if kind == "none":
         return None
+    if kind == "nothing":
+        return Nothing
     value = _whole(entry["value"], enums)
     if kind is None:
         return value

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import builtins
 import copy
+import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain, takewhile
+from types import FunctionType
 from typing import Any, Final
 
 from epypes.bundle.clone import is_plain_pipeline
@@ -22,10 +25,12 @@ from epypes.bundle.expressions import (
     names_in,
 )
 from epypes.bundle.module import module_text
-from epypes.bundle.objects import without_nodes
+from epypes.bundle.objects import is_of_library, without_nodes
+from epypes.bundle.references import global_names, meanings_of, nested_codes
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, Switch, as_switch
+from epypes.nothing import Nothing
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 from epypes.run.guard import in_out_places
@@ -87,7 +92,9 @@ def to_source(
     -----
     What a runner does around functions is not written: arrays are passed as they are, not as read-only views, and
     annotations are not compared with values. A function of OpenCV that writes into an input gets a copy of it, as in a
-    run. A function that several branches of a switch need is called before the switch, whichever is chosen.
+    run. A function that several branches of a switch need is called before the switch, whichever is chosen. The call
+    of a function that takes what may be Nothing stands inside an ``if``: an output of a function that refers to
+    ``ep.Nothing``, or calls one by name that does, and what is made of it.
 
     Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, name code generation as further work.
 
@@ -196,6 +203,27 @@ def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dic
     return regions, [token for token in cg.tokens if token in seen]
 
 
+def _may_find_nothing(function: Any) -> bool:
+    """Whether a function, or one of the user's that it calls by name, refers to Nothing, also as ``ep.Nothing``."""
+    if is_plain_pipeline(function):
+        return any(_may_find_nothing(without_nodes(inner)) for inner in function.cg.functions.values())
+    pending, seen = [function], set[int]()
+    while pending:
+        reached = without_nodes(pending.pop())
+        reached = inspect.unwrap(reached) if callable(reached) else reached
+        reached = reached.func if type(reached) is partial else reached
+        if not isinstance(reached, FunctionType) or id(reached) in seen or is_of_library(reached):
+            continue
+        seen.add(id(reached))
+        codes = [*nested_codes(reached.__code__)]
+        meant = meanings_of(reached, {*global_names(reached.__code__), *reached.__code__.co_freevars}).values()
+        is_named = any("Nothing" in code.co_names for code in codes)
+        if any(value is Nothing or (is_named and getattr(value, "Nothing", None) is Nothing) for value in meant):
+            return True
+        pending += meant
+    return False
+
+
 def _common(regions: Sequence[Region]) -> Region:
     """Return the innermost region around all of these."""
     levels = takewhile(lambda level: len(set(level)) == 1, zip(*regions, strict=False))
@@ -235,6 +263,10 @@ class _Function:
         The expression that refers to what copies them; empty if there are none.
     defaults
         By hyperparameter, the expression of its value.
+    may_be_nothing
+        The tokens that may be Nothing.
+    nothing
+        The expression of Nothing; "" if it is not needed.
     variables
         By token.
     """
@@ -243,6 +275,7 @@ class _Function:
         self, module: _Module, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: Any, where: str = ""
     ) -> None:
         self.module, self.name, self.cg, self.where = module, name, cg, where
+        self.values = values
         self.returns = cg.sink_tokens if wanted is None else wanted
         self.regions, tokens = _regions(cg, self.returns, wanted is None)
         missing = [each for each in cg.placeholders if each in self.regions]
@@ -257,6 +290,8 @@ class _Function:
         self.copied = {each: places for each, places in copied.items() if places}
         self.copy = module.expression("The copy of an input", copy.deepcopy, _NO_EXPRESSION) if self.copied else ""
         self.defaults = {token: self._default(token, value) for token, value in values.items() if token in tokens}
+        self.may_be_nothing = self._found_nothing()
+        self.nothing = self._nothing() if self.may_be_nothing else ""
         self.variables = self._named(tokens)
         module.texts.append(self._text())
 
@@ -270,6 +305,18 @@ class _Function:
             where = f" of pipeline {function.name!r}"
             _Function(module, inner, function.cg, function.runner.hyperparameters, None, where)
         return module.pipelines[id(function)]
+
+    def _nothing(self) -> str:
+        return self.module.expression("Nothing", Nothing, _NO_EXPRESSION)
+
+    def _found_nothing(self) -> set[str]:
+        """Return the tokens that may be Nothing."""
+        found: set[str] = {token for token, value in self.values.items() if value is Nothing}
+        for name in self.regions:
+            inputs, function = self.cg.func_inputs(name), without_nodes(self.cg.functions[name])
+            if not found.isdisjoint(inputs) or _may_find_nothing(function):
+                found.update(self.cg.func_outputs(name))
+        return found
 
     def _keys(self, name: str, switch: Switch) -> dict[str, list[str]]:
         """Return the expressions of the values by which a switch chooses each token."""
@@ -306,7 +353,7 @@ class _Function:
     def _named(self, tokens: Iterable[str]) -> dict[str, str]:
         """Return a variable for each token that hides nothing of the module; names that can stay come first."""
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
-        sources = {*self.calls.values(), *keys, *filter(None, [self.copy])}
+        sources = {*self.calls.values(), *keys, *filter(None, [self.copy, self.nothing])}
         taken = {name for source in sources for name in names_in(source)} | {"ValueError"}
         found: dict[str, str] = {}
         for token in sorted(tokens, key=lambda token: not is_identifier(token) or token in taken):
@@ -320,10 +367,37 @@ class _Function:
             if name in self.switches:
                 yield from self._switch(name, region)
             else:
-                arguments = [self.variables[token] for token in self.cg.func_inputs(name)]
-                for place in self.copied.get(name, ()):
-                    arguments[place] = f"{self.copy}({arguments[place]})"
-                yield from laid_out(f"{self.calls[name]}({', '.join(arguments)})", len(region) + 1, self._targets(name))
+                yield from self._guarded(name, len(region) + 1)
+
+    def _guarded(self, name: str, depth: int) -> Iterator[str]:
+        """Give the lines of a call; inside an ``if`` where an input may be Nothing."""
+        pad, inputs = "    " * depth, self.cg.func_inputs(name)
+        asked = [self.variables[token] for token in dict.fromkeys(inputs) if token in self.may_be_nothing]
+        if not asked:
+            yield from self._call_lines(name, depth)
+            return
+        targets = "".join(f"{self.variables[token]} = " for token in self.cg.func_outputs(name))
+        if targets:
+            yield f"{pad}if {' or '.join(f'{each} is {self.nothing}' for each in asked)}:"
+            yield from (f"{pad}    {targets}{self.nothing}", f"{pad}else:")
+        else:
+            yield f"{pad}if {' and '.join(f'{each} is not {self.nothing}' for each in asked)}:"
+        yield from self._call_lines(name, depth + 1)
+
+    def _call_lines(self, name: str, depth: int) -> Iterator[str]:
+        arguments = [self.variables[token] for token in self.cg.func_inputs(name)]
+        for place in self.copied.get(name, ()):
+            arguments[place] = f"{self.copy}({arguments[place]})"
+        call, outputs = f"{self.calls[name]}({', '.join(arguments)})", self.cg.func_outputs(name)
+        if self.cg.has_single_output(name) or not outputs or outputs[0] not in self.may_be_nothing:
+            yield from laid_out(call, depth, self._targets(name))
+            return
+        # Nothing alone stands for all of them.
+        first, pad = self.variables[outputs[0]], "    " * depth
+        targets = "".join(f"{self.variables[token]} = " for token in outputs)
+        yield from laid_out(call, depth, f"{first} = ")
+        yield from (f"{pad}if {first} is {self.nothing}:", f"{pad}    {targets}{self.nothing}", f"{pad}else:")
+        yield f"{pad}    {self._targets(name)}{first}"
 
     def _targets(self, name: str) -> str:
         """Return what stands before the value of a function."""

@@ -57,6 +57,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     from epypes.bundle.manifest import SETTINGS, check_manifest
     from epypes.bundle.settings import read_settings
     from epypes.display.previews.preview import preview
+    from epypes.nothing import Nothing
     from epypes.service import Client
 
     check_manifest(bundle)
@@ -67,15 +68,18 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     with Client(bundle, **options) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
-    for token, file in files.items():
+    written = {token: file for token, file in files.items() if answer.tokens[token] is not Nothing}
+    for token, file in written.items():
         _write(file, answer.tokens[token], settings.order(token))
     if as_json:
         click.echo(json.dumps(asdict(replace(answer, tokens={}))))
         return
     for token, value in answer.tokens.items():
-        if token not in files:
+        if value is Nothing:
+            click.echo(f"{token} = Nothing{f': {files[token]} is not written' if token in files else ''}")
+        elif token not in written:
             click.echo(f"{token} = {preview(value).text}")
-    _print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
+    _print_answer(" ".join([f"{bundle}:", *written.values()]), answer)
 
 
 def _print_answer(title: str, answer: Answer) -> None:

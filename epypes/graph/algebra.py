@@ -356,7 +356,7 @@ def delay(cg: CompGraph, token: str, previous: str, initial: Any = None) -> Comp
 
     In each run the source token ``previous`` has the value that ``token`` had at the end of the last completed run, and
     ``initial`` in the first one. A ``rerun`` and a ``trial`` see the same previous value as the run that they repeat. A
-    run that fails, or does not compute ``token``, leaves the state as it was.
+    run that fails, does not compute ``token``, or for which it is ``Nothing``, leaves the state as it was.
 
     Parameters
     ----------

@@ -262,8 +262,8 @@ class Pipeline(Node, TokenMapping):
     def compute_overhead(self) -> float:
         """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times.
 
-        Nodes that a switch or a failure kept from running do not count. Where nodes ran side by side, it is that of
-        the last run's report: wall time less the critical path.
+        Nodes that a switch, a failure or Nothing kept from running do not count. Where nodes ran side by side, it is
+        that of the last run's report: wall time less the critical path.
         """
         last, nodes = self.runner.last, self.network.nodes
         report = None if last is None else last.report
@@ -280,7 +280,8 @@ class Pipeline(Node, TokenMapping):
         if last is None:
             return self.network.nodes
         # Of a rerun, which counts as no call, the times of what was reused are still those of the call.
-        return [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
+        entries = last.report.functions
+        return [entry.function for entry in entries if entry.ran or (last.failure is None and entry.reused)]
 
 
 def _allows(hint: Param | Roi, value: Any) -> bool:

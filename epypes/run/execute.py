@@ -1,7 +1,8 @@
 """Running steps: compiled where a run repeats, one by one otherwise, in threads where the last times say that they pay.
 
 All three ways change one `TokenManager` and one list of durations by step, so what is left of a run that fails is the
-same in each. The step that is being run is written down before its inputs are read.
+same in each. The step that is being run is written down before its inputs are read. A compiled run ends at the first
+step that is given Nothing, before it is called; the loop goes on from there. So the compiled run need not look for it.
 """
 
 from __future__ import annotations
@@ -12,15 +13,14 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from contextvars import copy_context
-from functools import partial
 from math import inf
 from sys import getrefcount
 from time import perf_counter_ns
 from types import BuiltinFunctionType
 from typing import Any, Final
 
-from epypes.errors import ContractBroken, InputMutated, OutputArityError
-from epypes.images import Image
+from epypes.nothing import Nothing, NothingGiven, NothingType
+from epypes.run.call import call, unpack
 from epypes.run.guard import (
     ARRAYLESS,
     FRESH,
@@ -29,14 +29,10 @@ from epypes.run.guard import (
     HARMLESS,
     LONG,
     array_type,
-    is_array,
     keep,
     lend,
-    writable,
-    writable_copy,
 )
 from epypes.run.program import Program, Step
-from epypes.run.snapshot import Snapshot
 from epypes.run.staleness import TokenManager, is_unchanged
 from epypes.run.timing import longest_path_ns
 
@@ -114,14 +110,21 @@ class Executor:
             if side_by_side:
                 SideBySide(tokens, wanted, durations_ns, self._workers).run()
             elif (compiled := self._find(key, tokens, wanted, plain, changed)) is not None:
-                compiled(tokens, tokens.values, tokens.dirty, durations_ns)
-                if tokens.origin is None:
+                is_whole = True
+                try:
+                    compiled(tokens, tokens.values, tokens.dirty, durations_ns)
+                except NothingGiven:
+                    is_whole = False
+                # Outside, so that what a function raises has no context.
+                if not is_whole:
+                    go_on_one_by_one(tokens, wanted, durations_ns)
+                elif tokens.origin is None:
                     left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
                     tokens.dirty = bytearray(left_out)
             else:
                 run_one_by_one(tokens, wanted, durations_ns)
                 if len(self._program.steps) <= _MAX_STEPS:
-                    self._kinds = [*map(type, tokens.values)]
+                    self._kinds = self._guessed(tokens.values)
         except BaseException as error:
             return side_by_side, error
         finally:
@@ -129,6 +132,30 @@ class Executor:
         if gain is not None:
             gain.learn(durations_ns, perf_counter_ns() - start_ns, side_by_side)
         return side_by_side, None
+
+    def _guessed(self, values: Sequence[Any]) -> list[type]:
+        """Return the types of values by slot; of one that is Nothing now, the type that it had before."""
+        kinds = [*map(type, values)]
+        if not (self._program.has_skipped and self._kinds):
+            return kinds
+        return [before if kind is NothingType else kind for before, kind in zip(self._kinds, kinds, strict=True)]
+
+    def go_on(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> BaseException | None:
+        """Run the steps that a compiled run has not come to, which ended with NothingGiven.
+
+        Returns
+        -------
+        BaseException or None
+            As ``execute`` does.
+        """
+        self._program.running.add(tokens)
+        try:
+            go_on_one_by_one(tokens, wanted, durations_ns)
+        except BaseException as error:
+            return error
+        finally:
+            self._program.running.discard(tokens)
+        return None
 
     def _find(
         self, key: Hashable, tokens: TokenManager, wanted: bytes | None, plain: frozenset[str], changed: tuple[str, ...]
@@ -166,118 +193,6 @@ class Executor:
 _INVERTED: Final = bytes((1, 0)).ljust(256)
 
 
-# -- one call ---------------------------------------------------------------------------------------------------------
-
-
-def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict[int, int]) -> Sequence[Any]:
-    """Call a step's function on the values of its inputs; return one value per output token, guarded.
-
-    Raises
-    ------
-    OutputArityError
-        The function returned the wrong number of values.
-    ContractBroken, InputMutated, IteratorRefused
-        It does not keep to its contract, changed an object inside an input, or returned what can be read only once.
-    """
-    # Unpacked at once: to look up one field of a named tuple takes as long.
-    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node, _ = step
-    if node is not None:
-        function = node.func
-    start_ns = 0
-    try:
-        if is_plain:
-            args = []
-            for slot in inputs:
-                value = values[slot]
-                args.append(value if type(value) in ARRAYLESS else lend(value))
-        else:
-            args = _args(program, step, values)
-            if program.check_mutation and switch is None:
-                function = partial(_call_checked, program, step, function, values)
-        start_ns = perf_counter_ns()
-        result = function(*args)
-        durations_ns[place] = perf_counter_ns() - start_ns
-        made: Sequence[Any]
-        if not single:
-            made = unpack(program, step, result, values)
-        elif type(result) in ARRAYLESS or not program.guard or switch is not None:
-            made = (result,)
-        else:
-            made = (keep(result, FRESH, program, outputs[0], values),)
-        if contracts is not None:
-            _check(program, step, contracts[1], outputs, made)
-    except BaseException:
-        durations_ns[place] = perf_counter_ns() - start_ns if start_ns else 0
-        raise
-    return made
-
-
-def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
-    """Return the inputs of a step that is not plain; a switch passes values on as they are stored."""
-    args = [values[slot] for slot in step.inputs]
-    if program.guard and step.switch is None:
-        pass_on = writable if step.unguarded else lend
-        args = [(writable_copy if at in step.in_out else pass_on)(arg) for at, arg in enumerate(args)]
-    if step.contracts is not None:
-        _check(program, step, step.contracts[0], step.inputs, args)
-    return args
-
-
-def _call_checked(program: Program, step: Step, function: Callable[..., Any], values: Sequence[Any], *args: Any) -> Any:
-    """Call a step's function; put back what it has changed of its inputs, and raise InputMutated."""
-    given = {program.tokens[slot]: values[slot] for slot in step.inputs}
-    if step.unguarded:  # which can write into memory that is locked for others
-        views = zip(step.inputs, args, strict=True)
-        given.update((program.tokens[slot], view) for slot, view in views if is_array(view))
-    before = Snapshot(given)
-    try:
-        result = function(*args)
-    except BaseException:
-        before.restore()
-        raise
-    token = before.changed()
-    if token is not None:
-        before.restore()
-        raise InputMutated(step.name, token, has_read_iterator=before.changed() is not None)
-    return result
-
-
-def _check(
-    program: Program, step: Step, contracts: Sequence[Image | None], slots: Sequence[int], values: Sequence[Any]
-) -> None:
-    """Raise ContractBroken for the first value that is not the image that the function's annotation says."""
-    for contract, slot, value in zip(contracts, slots, values, strict=False):
-        found = contract.found(value) if contract is not None else None
-        if contract is not None and found is not None:
-            raise ContractBroken(step.name, program.tokens[slot], contract, found, made=slots is step.outputs)
-
-
-def unpack(program: Program, step: Step, result: Any, values: Sequence[Any]) -> list[Any]:
-    """Return a result as one value per output token, guarded; a string or an array is not split.
-
-    Raises
-    ------
-    OutputArityError
-        It is not a tuple or list of as many values as there are output tokens.
-    """
-    if not step.outputs:
-        return []
-    got = f"one {type(result).__name__}"
-    if isinstance(result, tuple | list):
-        found = list(result)
-        if len(found) == len(step.outputs):
-            # The result, the list and the loop each hold a reference to an item; FRESH counts one of them. The items of
-            # a result that the function goes on holding are not fresh, whatever their counts say.
-            fresh_count = 0 if getrefcount(result) > FRESH else FRESH + 2
-            if not program.guard:
-                return found
-            # No zip(), which would hold a reference too.
-            slots = iter(step.outputs)
-            return [keep(item, fresh_count, program, next(slots), values) for item in found]
-        got = f"{type(result).__name__} of {len(found)}"
-    raise OutputArityError(step.name, [program.tokens[slot] for slot in step.outputs], got)
-
-
 # -- one by one -------------------------------------------------------------------------------------------------------
 
 
@@ -291,8 +206,23 @@ def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dic
         if wanted is None or wanted[place]:
             tokens.running = place
             step = steps[place]
-            store(step, call(program, step, values, durations_ns))
+            try:
+                made = call(program, step, values, durations_ns)
+            except NothingGiven:
+                tokens.skip(step)
+            else:
+                store(step, made)
         place = next_dirty(1, place + 1)
+
+
+def go_on_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
+    """Run the dirty steps that a compiled run has not come to, which ended with NothingGiven."""
+    if tokens.origin is None:
+        tokens.dirty = bytearray(place not in durations_ns for place in range(len(tokens.dirty)))
+    else:
+        # What was new to any step is not known: a compiled run does not write it down.
+        tokens.origin = b"\1" * len(tokens.dirty)
+    run_one_by_one(tokens, wanted, durations_ns)
 
 
 # -- compiled ---------------------------------------------------------------------------------------------------------
@@ -310,6 +240,8 @@ _NAMES: Final = {
     "call": call,
     "unpack": unpack,
     "is_unchanged": is_unchanged,
+    "Nothing": Nothing,
+    "NothingGiven": NothingGiven,
 }
 _FREQUENT: Final = ("clock", "kind", "count", "array", "HARMLESS")
 
@@ -437,6 +369,9 @@ class _Source:
             yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(program, steps[{step.place}], v, d)"
             return
         args = [f"v[{slot}]" for slot in step.inputs]
+        if not program.guard and (asked := [slot for slot in step.inputs if slot not in self._plain]):
+            # Nothing else looks at the inputs.
+            yield f"if {' or '.join(f'v[{slot}] is Nothing' for slot in asked)}: start = 0; raise NothingGiven"
         for place, slot in enumerate(step.inputs):
             if self._is_lent_first(step, slot) and step.inputs.index(slot) == place:
                 args[place] = f"s{step.place}_{slot}"
@@ -549,7 +484,8 @@ class SideBySide:
         program, values = tokens.program, tokens.values
         self._tokens, self._durations_ns, self._workers = tokens, durations_ns, workers
         self._before = values.copy(), tokens.dirty.copy()
-        self._made: dict[int, Sequence[Any]] = {}
+        # What each step has made; None if it was skipped.
+        self._made: dict[int, Sequence[Any] | None] = {}
         self._failures: dict[int, BaseException] = {}
         self._calls: set[int] = set()
         self._is_over = False
@@ -582,11 +518,14 @@ class SideBySide:
         if self._failures:
             failed_at = min(self._failures)
             tokens.values[:], tokens.dirty[:] = self._before
-            for place in sorted(self._made):
-                if place < failed_at:
-                    tokens.store(tokens.program.steps[place], self._made[place])
+            for place, made in sorted(self._made.items()):
+                step = tokens.program.steps[place]
+                if place > failed_at:
+                    self._durations_ns.pop(place, None)
+                elif made is None:
+                    tokens.skip(step)
                 else:
-                    del self._durations_ns[place]
+                    tokens.store(step, made)
             for place in self._failures:
                 if place != failed_at:
                     del self._durations_ns[place]
@@ -610,12 +549,14 @@ class SideBySide:
         program, mark = tokens.program, _Call(place)
         step = program.steps[place]
         failure: BaseException | None = None
-        made: Sequence[Any] = ()
+        made: Sequence[Any] | None = None
         self._calls.add(place)
         program.running.add(mark)
         self._changed.release()
         try:
             made = call(program, step, tokens.values, self._durations_ns)
+        except NothingGiven:
+            pass
         except BaseException as exception:
             failure = exception
         finally:
@@ -626,7 +567,10 @@ class SideBySide:
         self._calls.discard(place)
         if failure is None:
             self._made[place] = made
-            tokens.store(step, made)
+            if made is None:
+                tokens.skip(step)
+            else:
+                tokens.store(step, made)
             self._release(place)
         else:
             self._failures[place] = failure

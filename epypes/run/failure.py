@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from epypes.run.guard import explain_write, is_array, lend
+from epypes.run.guard import explain_write, is_array, lend_to_reader
 from epypes.run.staleness import TokenManager
 
 # A note is one line that names the culprit, so a value in it is short.
@@ -114,6 +114,6 @@ def _brief(value: Any) -> str:
 
 def _lent(value: Any) -> Any:
     try:
-        return lend(value)
+        return lend_to_reader(value)
     except Exception:  # an array's own class does not let it be viewed, which may be what failed
         return value

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from epypes.errors import IteratorRefused
 from epypes.graph.identity import innermost
 from epypes.graph.signature import documented_in_out
+from epypes.nothing import Nothing, NothingGiven, NothingType
 
 if TYPE_CHECKING:
     from epypes.run.program import Program
@@ -37,6 +38,8 @@ WRITTEN: Final = "__epypes_written__"
 _WATCHED: Final = frozenset({FunctionType, functools.partial, functools._lru_cache_wrapper})
 # What holds no array, known at a glance: most values of a graph are looked at several times per run.
 ARRAYLESS: Final = frozenset({int, float, bool, str, bytes, complex, type(None)})
+# What readers get as it is stored; functions never get Nothing.
+READ_AS_STORED: Final = ARRAYLESS | {NothingType}
 # Of a long tuple or list the first item tells whether it holds arrays: to look at each of 500 keypoints would take
 # 10 us at every call, and much more when they are not in the caches.
 LONG: Final = 33
@@ -203,10 +206,16 @@ def own_view(value: Any) -> Any:
 
 
 def lend(value: Any) -> Any:
-    """Return a value as a function or a reader gets it: arrays as read-only views of its own, containers as copies.
+    """Return a value as a function gets it: arrays as read-only views of its own, containers as copies.
 
     The arrays in a tuple, named tuple, list, deque or dict count; what is deeper is shared. A masked array is copied,
     since its mask can be changed through any view.
+
+    Raises
+    ------
+    NothingGiven
+        The value is Nothing, which functions don't receive. Every guarded input of a value that is no number, text or
+        array comes by here, so the usual ones are not asked.
     """
     kind = type(value)
     if kind in ARRAYLESS:
@@ -217,8 +226,15 @@ def lend(value: Any) -> Any:
         return view
     if is_array(value):
         return _locked(own_view(value))
+    if value is Nothing:
+        raise NothingGiven
     made = _own_copy(value)
     return _with_items(made, lend) if _holds_arrays(made) else made
+
+
+def lend_to_reader(value: Any) -> Any:
+    """Return a value as the user gets it: as ``lend`` does, and Nothing too."""
+    return value if type(value) in READ_AS_STORED else lend(value)
 
 
 def _locked(value: Any) -> Any:

@@ -32,7 +32,7 @@ class Plan:
         The tokens asked for; empty for all.
     order
         The functions that would run, in run order. One of them is passed over at run time if what it takes turns
-        out to be unchanged.
+        out to be unchanged, or to be Nothing.
     reused
         The functions that are needed and up to date.
     missing

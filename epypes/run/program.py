@@ -93,7 +93,7 @@ class StateSlots(NamedTuple):
 
 
 class Program:
-    """A compiled graph; nothing in it changes but ``running``.
+    """A compiled graph; nothing in it changes but ``running`` and ``has_skipped``.
 
     Attributes
     ----------
@@ -121,6 +121,8 @@ class Program:
         Of runs that have ended, nanoseconds by step, for nodes to count; None if there are no nodes.
     running
         What runs at this moment, in any thread: objects whose ``running`` is a step, or -1.
+    has_skipped
+        Whether any run has met Nothing. As long as none has, no run looks for it.
     selectors
         By the selector's token, the switches that it selects for.
     revised
@@ -146,6 +148,7 @@ class Program:
         for _, node in self.nodes:
             node.programs.append(ref(self, node.programs.remove))
         self.running: set[Any] = set()
+        self.has_skipped = False
         self.clean = bytes(len(steps))
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)

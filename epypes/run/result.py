@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph import CompGraph, redefined
+from epypes.nothing import Nothing
 from epypes.rich_display import mimebundle
 from epypes.run.failure import Failure
-from epypes.run.guard import ARRAYLESS, lend
+from epypes.run.guard import READ_AS_STORED, lend, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.program import Program
+from epypes.run.program import Program, StateSlots
 from epypes.run.staleness import NOT_COMPUTED, TokenManager
 from epypes.run.timing import RunReport, Times
 from epypes.wording import counted
@@ -91,20 +92,26 @@ class Run(TokenMapping):
 
     @property
     def state(self) -> Mapping[str, Any]:
-        """What the next run begins with, by delayed token; see ``ep.delay``. Of a failed run, what it began with."""
+        """What the next run begins with, by delayed token; see ``ep.delay``.
+
+        Of a failed run, and where nothing was found, it is what the run began with.
+        """
         states, guard = self.record[4].program.states, self.record[4].program.guard
         values = zip(states, self.state_after(), strict=True)
         known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
-        return MappingProxyType({key: lend(value) if guard else value for key, value in known.items()})
+        return MappingProxyType({key: lend_to_reader(value) if guard else value for key, value in known.items()})
 
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
         values, *_, failure = self.record
-        # Of a rerun for other targets the value may be stale: it is still what the frame has left.
-        return tuple(
-            values[slots.before] if failure or values[slots.after] is NOT_COMPUTED else values[slots.after]
-            for slots in self.record[4].program.states
-        )
+
+        def value_after(slots: StateSlots) -> Any:
+            after = values[slots.after]
+            # Of a rerun for other targets the value may be stale: it is still what the frame has left.
+            is_kept = failure or after is NOT_COMPUTED or after is Nothing
+            return values[slots.before] if is_kept else after
+
+        return tuple(map(value_after, self.record[4].program.states))
 
     @property
     def cg(self) -> CompGraph:
@@ -129,7 +136,7 @@ class Run(TokenMapping):
         slot = hparams.program.slots.get(token)
         if slot is not None and has_payload and 1 not in dirty:
             value = values[slot]
-            return value if type(value) in ARRAYLESS or not hparams.program.guard else lend(value)
+            return value if type(value) in READ_AS_STORED or not hparams.program.guard else lend(value)
         try:
             return self.tokens.read(token)
         except StaleToken:
@@ -192,7 +199,7 @@ class RunImporter:
             Of the function that failed, if one did.
         """
         program, first = self._program, first_hyperparameters or {}
-        slots = [NOT_COMPUTED] * len(program.tokens)
+        slots: list[Any] = [NOT_COMPUTED] * len(program.tokens)
         for token, value in {**tokens, **hyperparameters}.items():
             if token in program.slots:
                 slots[program.slots[token]] = value
@@ -201,9 +208,21 @@ class RunImporter:
         known = durations_ns or {}
         by_step = {step.place: known[step.name] for step in program.steps if step.name in known}
         failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
-        times = (program, None, by_step, total_ns, False, failed_at)
+        skipped = tuple(self._skip(slots, by_step))
+        times = (program, None, by_step, total_ns, False, failed_at, skipped)
         hparams = Hyperparameters(program, entries, revision)
         return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
+
+    def _skip(self, slots: list[Any], ran: Container[int]) -> Iterator[int]:
+        """Give the steps that were skipped, as far as the tokens say, whose outputs become Nothing."""
+        program = self._program
+        for step in program.steps:
+            seen = [slots[slot] is Nothing for slot in (*program.read_by(step, slots), *step.outputs)]
+            if step.place not in ran and any(seen):
+                program.has_skipped = True
+                for slot in step.outputs:
+                    slots[slot] = Nothing
+                yield step.place
 
 
 # Half the time of Run(...).

@@ -15,14 +15,15 @@ from weakref import ref
 from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
+from epypes.nothing import NothingGiven
 from epypes.run.execute import CompiledRun, Executor
 from epypes.run.failure import failure_of
-from epypes.run.guard import COPIERS, keep, lend, require_reusable
+from epypes.run.guard import COPIERS, keep, lend_to_reader, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
 from epypes.run.result import Run, TokenMapping, TrialOf, new_run
-from epypes.run.staleness import TokenManager
+from epypes.run.staleness import TokenManager, skipped_steps
 from epypes.run.timing import Reports
 from epypes.wording import counted
 
@@ -266,10 +267,18 @@ class CompGraphRunner(OldNames, TokenMapping):
             self._wanted[tuple(targets)] = wanted
         durations_ns: dict[int, int] = {}
         side_by_side, error = self._executor.execute(tokens, wanted, durations_ns, hparams.plain, changed)
+        return self._ended(tokens, hparams, wanted, durations_ns, start_ns, trial_of, error, side_by_side)
+
+    def _ended(
+        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: dict[int, int],
+        start_ns: int, trial_of: TrialOf | None, error: BaseException | None, side_by_side: bool = False,
+    ) -> Run:  # fmt: skip
+        """Record the run that has left these tokens, and end it; ``error`` is what the running step raised."""
         if error is not None:
             run = self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error, side_by_side)
         else:
-            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1
+            program, skipped = self._program, skipped_steps(self._program, tokens.values, tokens.dirty)
+            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1, skipped
             program.note_calls(durations_ns)
             dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
             run = Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, None))
@@ -293,15 +302,19 @@ class CompGraphRunner(OldNames, TokenMapping):
         finally:
             program.running.discard(run)
         if error is not None:
-            tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
+            left = bytearray(b"\1") * len(program.steps) if dirty is None else dirty
+            tokens = TokenManager.of_run(program, values, left, True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
-            return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
+            if isinstance(error, NothingGiven):
+                error = self._executor.go_on(tokens, wanted, durations_ns)
+            return self._ended(tokens, hparams, wanted, durations_ns, start_ns, trial_of, error)
         total_ns = perf_counter_ns() - start_ns
         if total_ns > self._executor.short_ns:
             hparams.repeated = None
-        times = program, wanted, durations_ns, total_ns, False, -1
         # Without targets everything is up to date then.
         left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
+        skipped = skipped_steps(program, values, left_dirty) if program.has_skipped else ()
+        times = program, wanted, durations_ns, total_ns, False, -1, skipped
         run.record = values, left_dirty, True, revisions, hparams, times, None
         if (uncounted := program.uncounted) is not None:
             uncounted.append(durations_ns)
@@ -329,14 +342,15 @@ class CompGraphRunner(OldNames, TokenMapping):
         durations_ns.setdefault(failed_at, 0)
         program.note_calls(durations_ns)
         if tokens.origin is None:
-            tokens.dirty = bytearray(step.place not in durations_ns for step in program.steps)
+            tokens.dirty = bytearray(left and place not in durations_ns for place, left in enumerate(tokens.dirty))
         failure = failure_of(tokens, failed_at, error)
         tokens.forget(program.downstream([failed_at], tokens.values))
         # Of the steps that were not reached none was reused.
         reached = bytearray(wanted or b"\1" * len(program.steps))
         for place in tokens.stale:
             reached[place] = 0
-        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at
+        skipped = skipped_steps(program, tokens.values, tokens.dirty)
+        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at, skipped
         dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
         return Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, failure))
 
@@ -532,7 +546,10 @@ class CompGraphRunner(OldNames, TokenMapping):
         """
         states, kept = self._program.states, self._kept
         return MappingProxyType(
-            {slots.key: lend(value) if self.guard else value for slots, value in zip(states, kept, strict=True)}
+            {
+                slots.key: lend_to_reader(value) if self.guard else value
+                for slots, value in zip(states, kept, strict=True)
+            }
         )
 
     @state.setter
@@ -606,7 +623,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         hparams, last = self._state
         if token in hparams.entries:
             value = hparams.entries[token][0]
-            return lend(value) if self.guard else value
+            return lend_to_reader(value) if self.guard else value
         if last is None:
             self.cg.require_token(token)
             text = f"Token {token!r} has not been computed: nothing has been run. Call {run_call(hparams.free_slots)}."
@@ -680,7 +697,7 @@ def stop_at(
         tokens, durations_ns = runner._beginning(hparams, payload, runner._kept), {}
     wanted = bytes(len(program.steps))
     if function is None or why is None:
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1, ()
         run = Run((tokens.values, bytes(tokens.dirty), tokens.has_payload, tokens.revisions, hparams, times, None))
     else:
         tokens.running = next(step.place for step in program.steps if step.name == function)

@@ -12,10 +12,11 @@ from typing import Any, Final
 from epypes.deprecation import OldNames
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph import CompGraph
-from epypes.run.guard import is_plain_array, is_same_guarded_array, lend
+from epypes.nothing import Nothing, NothingType
+from epypes.run.guard import is_plain_array, is_same_guarded_array, lend_to_reader
 from epypes.run.program import Program, Step
 
-_SCALARS: Final = frozenset({int, float, complex, bool, type(None)})
+_SCALARS: Final = frozenset({int, float, complex, bool, type(None), NothingType})
 _TEXTS: Final = frozenset({str, bytes})
 _SMALL_TUPLE: Final = 16
 # Longer texts (an encoded image) are taken for new unless they are the same object.
@@ -162,6 +163,11 @@ class TokenManager(OldNames):
                 self.dirty[place] = 1
         return True
 
+    def skip(self, step: Step) -> None:
+        """Store Nothing as all that a step makes, since one of its inputs is Nothing."""
+        self.program.has_skipped = True
+        self.store(step, [Nothing] * len(step.outputs))
+
     def forget(self, steps: Iterable[int]) -> None:
         """Make the outputs of these steps read as not computed."""
         for place in steps:
@@ -182,6 +188,20 @@ class TokenManager(OldNames):
     def is_computed(self, token: str) -> bool:
         """Whether the token has a value, be it stale."""
         return self.values[self.program.slots[token]] is not NOT_COMPUTED
+
+    def is_nothing(self, token: str) -> bool:
+        """Whether the token's value, be it stale, is Nothing."""
+        return self.values[self.program.slots[token]] is Nothing
+
+    def lacking(self) -> dict[str, tuple[str, ...]]:
+        """Return by function, of those that read a token whose value is Nothing, these tokens."""
+        program, values = self.program, self.values
+        found: dict[str, tuple[str, ...]] = {}
+        for step in program.steps:
+            slots = [slot for slot in dict.fromkeys(program.read_by(step, values)) if values[slot] is Nothing]
+            if slots:
+                found[step.name] = tuple(program.tokens[slot] for slot in slots)
+        return found
 
     def is_stale(self, token: str) -> bool:
         """Whether the token has a value that is out of date."""
@@ -217,7 +237,7 @@ class TokenManager(OldNames):
             way_out = f"Call rerun({token!r}), or run() with the graph's payload."
             way_out = f"Pass it: run({token}=...)." if is_source else way_out
             raise NotComputed(token, f"Token {token!r} has not been computed. {way_out}")
-        return lend(value) if program.guard else value
+        return lend_to_reader(value) if program.guard else value
 
     def __getitem__(self, token: str) -> Any:
         return self.read(token)
@@ -229,8 +249,19 @@ class TokenManager(OldNames):
         return (token for token in self.program.cg.tokens if self.is_readable(token))
 
 
+def skipped_steps(program: Program, values: Sequence[Any], dirty: Sequence[int]) -> tuple[int, ...]:
+    """Return the steps that are up to date without having run, since an input that they read is Nothing."""
+    if not program.has_skipped:
+        return ()
+    return tuple(
+        step.place
+        for step in program.steps
+        if not dirty[step.place] and any(values[slot] is Nothing for slot in program.read_by(step, values))
+    )
+
+
 def is_same_value(old: Any, new: Any) -> bool:
-    """Whether two immutable values are cheaply known to be equal: numbers, short texts and small tuples of them.
+    """Whether two immutable values are cheaply known to be equal: numbers, None, Nothing, short texts, small tuples.
 
     The types must agree, so that True is not 1 and 1 is not 1.0; NaN is not equal to itself, so it counts as new.
     Arrays are never compared.

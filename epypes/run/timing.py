@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side, the
-# step that failed (-1 if none did). A RunReport is made of them when it is read. Durations of large graphs are packed:
-# one for every step, -1 for those that did not run.
+# step that failed (-1 if none did), the steps that were skipped. A RunReport is made of them when it is read. Durations
+# of large graphs are packed: one for every step, -1 for those that did not run.
 Durations = dict[int, int] | Sequence[int]
-Times = tuple[Program, bytes | None, Durations, int, bool, int]
+Times = tuple[Program, bytes | None, Durations, int, bool, int, tuple[int, ...]]
 
 KEPT: Final = 1_000
 # Packed above that: a thousand reports would hold a gigabyte of integers.
 _MAX_UNPACKED: Final = 400
-_COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed")
+_COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed", "skipped")
 _SUMMARY_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
 _STANDARD: Final = NormalDist()
 # Fewer durations say nothing of the tails: two that differ by a factor of 3 would get a range of a factor of 6.
@@ -56,17 +56,25 @@ class FunctionTime:
     Attributes
     ----------
     duration_ns
-        In nanoseconds; of a function that failed until it raised, of one that was reused 0.
+        In nanoseconds; of a function that failed until it raised, of one that was not called 0.
     ran
-        Whether it was called, to whatever end; if not, it was reused.
+        Whether it was called, to whatever end; if not, it was reused or skipped.
     failed
         Whether it raised.
+    skipped
+        Whether it was not called since one of its inputs is Nothing.
     """
 
     function: str
     duration_ns: int
     ran: bool
     failed: bool = False
+    skipped: bool = False
+
+    @property
+    def reused(self) -> bool:
+        """Whether its outputs were still up to date."""
+        return not self.ran and not self.skipped
 
 
 class RunReport:
@@ -82,7 +90,7 @@ class RunReport:
         Nanoseconds by step that ran.
     """
 
-    __slots__ = ("_failed_at", "_program", "_wanted", "ran_ns", "side_by_side", "total_ns")
+    __slots__ = ("_failed_at", "_program", "_skipped", "_wanted", "ran_ns", "side_by_side", "total_ns")
 
     def __init__(
         self,
@@ -92,9 +100,10 @@ class RunReport:
         total_ns: int,
         side_by_side: bool = False,
         failed_at: int = -1,
+        skipped: Sequence[int] = (),
     ) -> None:
         self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
-        self._failed_at = failed_at
+        self._failed_at, self._skipped = failed_at, skipped
         if not isinstance(durations_ns, dict):
             durations_ns = {place: duration for place, duration in enumerate(durations_ns) if duration >= 0}
         self.ran_ns = durations_ns
@@ -107,11 +116,11 @@ class RunReport:
     @property
     def functions(self) -> tuple[FunctionTime, ...]:
         """One entry per function that the run needed, in run order; of a failed run those it came to."""
-        ran_ns, wanted, failed_at = self.ran_ns, self._wanted, self._failed_at
+        ran_ns, wanted, failed_at, skipped = self.ran_ns, self._wanted, self._failed_at, frozenset(self._skipped)
         return tuple(
-            FunctionTime(step.name, ran_ns.get(step.place, 0), step.place in ran_ns, step.place == failed_at)
-            for step in self._program.steps
-            if wanted is None or wanted[step.place] or step.place in ran_ns
+            FunctionTime(step.name, ran_ns.get(place, 0), place in ran_ns, place == failed_at, place in skipped)
+            for place, step in enumerate(self._program.steps)
+            if wanted is None or wanted[place] or place in ran_ns
         )
 
     @property
@@ -137,7 +146,12 @@ class RunReport:
     @property
     def reused(self) -> tuple[str, ...]:
         """The functions whose outputs were still up to date."""
-        return tuple(entry.function for entry in self.functions if not entry.ran)
+        return tuple(entry.function for entry in self.functions if entry.reused)
+
+    @property
+    def skipped(self) -> tuple[str, ...]:
+        """The functions that were not called since one of their inputs is Nothing."""
+        return tuple(entry.function for entry in self.functions if entry.skipped)
 
     @property
     def critical_path_ns(self) -> int:
@@ -156,7 +170,7 @@ class RunReport:
         return self.total_ns - sum(self.ran_ns.values())
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table: function, ran, time_ms, share (of the total), failed.
+        """Return a table: function, ran, time_ms, share (of the total), failed, skipped.
 
         A function that failed has ``ran`` true as well, and the time until it raised.
         """
@@ -165,18 +179,18 @@ class RunReport:
 
         return pd.DataFrame(self._rows(), columns=list(_COLUMNS))
 
-    def _rows(self) -> list[tuple[str, bool, float, float, bool]]:
+    def _rows(self) -> list[tuple[str, bool, float, float, bool, bool]]:
         """Return what ``to_frame`` has as rows."""
         total_ns = max(self.total_ns, 1)
         return [
-            (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / total_ns, entry.failed)
-            for entry in self.functions
+            (each.function, each.ran, each.duration_ns / 1e6, each.duration_ns / total_ns, each.failed, each.skipped)
+            for each in self.functions
         ]
 
     def __repr__(self) -> str:
-        failed = self._failed_at >= 0
-        ran = len(self.ran) - failed
-        return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{', 1 failed' * failed}>"
+        failed, skipped = self._failed_at >= 0, len(self.skipped)
+        ran, more = len(self.ran) - failed, f", {skipped} skipped" * bool(skipped) + ", 1 failed" * failed
+        return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{more}>"
 
     def __str__(self) -> str:
         from epypes.rich_display import to_text
@@ -216,7 +230,7 @@ class Reports(Sequence[RunReport]):
         return len(self.kept)
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total), failed."""
+        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of the run), failed, skipped."""
         with optional_import():
             import pandas as pd
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import MessageError
+from epypes.nothing import Nothing, NothingType
 from epypes.wire.arrays import read_image, read_tensor
 from epypes.wire.encoder import MAX_TOPIC_BYTES, REFUSALS, VERSION, encode
 from epypes.wire.envelope import SCALAR_FIELDS, Envelope, FailureRecord
@@ -278,6 +279,9 @@ class ValueReader:
     def _none(self, content: bool, path: Path) -> None:
         return None
 
+    def _nothing(self, content: bool, path: Path) -> NothingType:
+        return Nothing
+
     def _big_integer(self, content: str, path: Path) -> int:
         if not _HEXADECIMAL.fullmatch(content):
             raise MessageError("bad integer", f"{format_path(path)} is no hexadecimal integer: {content[:40]!r}.")
@@ -325,6 +329,7 @@ class ValueReader:
 # The kinds of Value that are not here (boolean, integer, number, text) need no conversion.
 _READ: Final[dict[str, Callable[[ValueReader, Any, Path], Any]]] = {
     "none": ValueReader._none,
+    "nothing": ValueReader._nothing,
     "big_integer": ValueReader._big_integer,
     "complex": ValueReader._complex,
     "encoded": ValueReader._bytes,

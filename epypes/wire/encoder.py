@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from epypes.errors import MessageError
+from epypes.nothing import NothingType
 from epypes.wire.arrays import flat_bytes, write_array
 from epypes.wire.envelope import SCALAR_FIELDS, Envelope, FailureRecord
 from epypes.wire.limits import DEFAULT_LIMITS, Limits, Path, ValueCounter, format_path, no_codec
@@ -60,9 +61,9 @@ def encode(
     Parameters
     ----------
     envelope
-        The message to send. Its values are None, bool, int, float, complex, str, bytes, list, tuple, dict, set,
-        frozenset, numpy arrays and scalars, OpenCV's KeyPoint and DMatch, DataFrames and Series of pandas, nested in
-        any way.
+        The message to send. Its values are None, Nothing, bool, int, float, complex, str, bytes, list, tuple, dict,
+        set, frozenset, arrays and scalars of numpy, KeyPoint and DMatch of OpenCV, DataFrames and Series of pandas, in
+        any nesting.
     topic
         The first frame, see `topic_frame`.
     inline_below
@@ -215,6 +216,9 @@ class ValueWriter:
     def _none(self, message: Any, value: None, path: Path) -> None:
         message.none = True
 
+    def _nothing(self, message: Any, value: NothingType, path: Path) -> None:
+        message.nothing = True
+
     def _boolean(self, message: Any, value: bool, path: Path) -> None:
         message.boolean = value
 
@@ -276,6 +280,7 @@ class ValueWriter:
 
 _WRITE: Final[dict[type, Callable[[ValueWriter, Any, Any, Path], None]]] = {
     type(None): ValueWriter._none,
+    NothingType: ValueWriter._nothing,
     bool: ValueWriter._boolean,
     int: ValueWriter._integer,
     float: ValueWriter._number,

@@ -55,8 +55,8 @@ def test_every_public_name_can_be_had_and_all_is_sorted():
     for name in epypes.__all__:
         assert getattr(epypes, name) is not None
         assert name in dir(epypes)
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = epypes.nothing
+    with pytest.raises(AttributeError, match="no attribute 'unknown'"):
+        _ = epypes.unknown
     with pytest.raises(AttributeError, match="from epypes_widgets import tune"):
         _ = epypes.tune
 

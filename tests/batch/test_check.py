@@ -351,3 +351,25 @@ def test_junit_that_can_t_be_written_is_told(result, tmp_path):
 
 def test_a_result_of_nothing_that_failed_is_true():
     assert CheckResult(())
+
+
+def found_above(image, level):
+    return image > level if (image > level).any() else ep.Nothing
+
+
+def test_a_check_of_nothing_passes_where_nothing_is_expected_and_falls_short_elsewhere(coins):
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"above": found_above}, {"above": (("image", "level"), "mask")}), {"level": 254}
+    )
+    result = ep.check(
+        runner,
+        [
+            ep.Case(coins, {"mask": ep.Nothing}, {"count": {"token": "mask", "max": 0}}, name="none"),
+            ep.Case(coins, {"mask": coins > 100}, {"iou": {"token": "mask", "min": 0.5}}, name="some"),
+            ep.Case(coins, {"mask": ep.Nothing}, hyperparameters={"level": 100}, name="too many"),
+        ],
+    )
+    assert result.cases == {"none": True, "some": False, "too many": False}
+    assert reasons(result)["some", "iou of mask"] == "nothing was found of 'mask'"
+    assert all(outcome.error_info is None for outcome in result.failures)
+    assert "nothing was found" in result._repr_html_()

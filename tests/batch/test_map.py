@@ -311,3 +311,42 @@ def test_a_file_that_was_missing_is_tried_again(runner, folder, crops, tmp_path)
         assert not store.series("map", name).keys()
     cv2.imwrite(str(files[0]), crops[0])
     assert not ep.map(runner, files, store=tmp_path / "r.sqlite").failures
+
+
+def brightest(image, minimum):
+    return int(image.max()) if image.max() >= minimum else ep.Nothing
+
+
+def outline(image, peak):
+    return image > peak / 2
+
+
+def test_where_nothing_was_found_the_cell_is_empty_and_nothing_has_failed():
+    cg = ep.CompGraph(
+        {"brightest": brightest, "outline": outline},
+        {"brightest": (("image", "minimum"), "peak"), "outline": (("image", "peak"), "mask")},
+    )
+    with_peak = ep.extend(cg, {"same": abs}, {"same": ("peak", "level")})
+    images = [np.full((8, 8), level, np.uint8) for level in (40, 200, 250)]
+    for executor in (None, ThreadPoolExecutor(2)):
+        result = ep.map(ep.CompGraphRunner(with_peak, {"minimum": 100}), images, executor=executor)
+        frame = result.to_frame()
+        assert frame["failure"].tolist() == [None] * 3
+        assert (str(frame["level"].dtype), frame["level"].mean(), frame["level"].isna().tolist()) == (
+            "Int64",
+            225,
+            [True, False, False],
+        )
+        assert frame["outline ms"].isna().tolist() == [True, False, False]
+        assert [outcome.nothing for outcome in result] == [("mask", "level"), (), ()]
+        html = result._repr_mimebundle_()["text/html"]
+        assert html.count("nothing found") >= 1
+
+
+def test_a_stored_outcome_still_says_that_nothing_was_found(tmp_path):
+    cg = ep.CompGraph({"brightest": brightest}, {"brightest": (("image", "minimum"), "peak")})
+    images = [np.full((8, 8), level, np.uint8) for level in (40, 200)]
+    runner = ep.CompGraphRunner(cg, {"minimum": 100})
+    first, again = (ep.map(runner, images, store=tmp_path / "results.db", name="peaks") for _ in range(2))
+    assert [outcome.nothing for outcome in again] == [outcome.nothing for outcome in first] == [("peak",), ()]
+    assert values(again, "peak") == [None, 200]

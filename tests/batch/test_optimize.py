@@ -687,3 +687,16 @@ def test_progress_is_shown_if_it_is_wanted(runner: ep.CompGraphRunner, capfd: py
     shown = capfd.readouterr().err
     assert "optimize score" in shown
     assert "3/3" in shown
+
+
+def peak_above(image, least):
+    return float(image.max()) if image.max() >= least else ep.Nothing
+
+
+def test_a_trial_for_which_nothing_was_found_has_failed_and_says_so():
+    cg = ep.CompGraph({"peak": peak_above}, {"peak": (("image", "least"), "top")})
+    runner = ep.CompGraphRunner(cg, {"least": 100})
+    result = ep.optimize(runner, "top", [np.full((4, 4), 50, np.uint8)], n=4, ranges={"least": (0, 255)}, seed=1)
+    failed = [trial for trial in result if trial.setting["least"] > 50]
+    assert {trial.failure for trial in failed} == {"top gave Nothing: nothing was found"}
+    assert all(trial.value == 50 for trial in result if trial not in failed)

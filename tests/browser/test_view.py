@@ -138,12 +138,31 @@ def test_on_a_narrow_page_the_controls_stand_right_below_the_picture(view: ViewP
     assert view.box(".epypes-box")["width"] > 550
 
 
+def test_where_nothing_was_found_a_text_takes_the_place_of_the_picture_and_the_stage_has_a_sign(view: ViewPage) -> None:
+    view.do(
+        "window.none = await kernel.frame({ skipped: 2, stages: { edges: 'nothing', n_edges: 'nothing' } });"
+        "none[0].pictures[0] = { token: 'edges', role: 'main', media_type: 'text/plain', text: 'edges: nothing found.', overlay: null };"
+        "kernel.deliver(none[0], [])"
+    )
+    view.until("document.querySelector('.epypes-text')?.textContent === 'edges: nothing found.'")
+    assert not view.page.locator("img.epypes-picture").is_visible()
+    chip = view.page.locator(".epypes-chip[data-token=edges]")
+    assert (chip.text_content(), chip.get_attribute("title")) == ("edges\u2205", "edges: nothing found")
+    assert view.text(".epypes-count") == "3 ran, 1 reused, 2 skipped"
+    view.do("await kernel.run()")
+    view.until("document.querySelector('img.epypes-picture').offsetParent !== null")
+    assert view.text(".epypes-count") == "3 ran, 1 reused"
+    assert chip.text_content() == "edges"
+
+
 @pytest.mark.parametrize("colours", ["light", "dark"])
 def test_every_text_can_be_read(view: ViewPage, colours: str) -> None:
     view.open(theme=colours)
     view.click(".epypes-histogram-button")
     _fail(view)
-    view.do("await kernel.run({ stale: true, stages: { edges: 'failed', blurred: 'stale', n_edges: 'absent' } })")
+    view.do(
+        "await kernel.run({ stale: true, stages: { edges: 'failed', blurred: 'stale', n_edges: 'absent', gray: 'nothing' } })"
+    )
     view.do("kernel.deliver({ kind: 'log', lines: [{ at: '12:03:11', text: 'A frame was sent again.' }] })")
     view.click(".epypes-log summary")
     view.click(".epypes-load")

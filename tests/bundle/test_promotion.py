@@ -642,3 +642,56 @@ def test_string_literals_of_indented_functions_are_promoted_as_they_are(tmp_path
     runner = ep.CompGraphRunner(ep.CompGraph({"f": notebook(source)["f"]}, {"f": ("x", "y")}))
     assert runner.run(x=1)["y"] == 11
     assert ep.load(ep.promote(runner, tmp_path / "b").path).run(x=1)["y"] == 11
+
+
+SEARCH = """
+import epypes as ep
+from epypes import Nothing
+
+def find(image, least):
+    if image.max() < least:
+        return {nothing}
+    return int(image.argmax())
+
+def mark(image, place):
+    marked = image.copy()
+    marked.flat[place] = 255
+    return marked
+"""
+
+
+@pytest.mark.parametrize("nothing", ["ep.Nothing", "Nothing"])
+def test_a_function_that_finds_nothing_is_promoted_with_samples_of_both(tmp_path, nothing):
+    names = notebook(SEARCH.format(nothing=nothing))
+    cg = ep.CompGraph(
+        {"find": names["find"], "mark": names["mark"]},
+        {"find": (("image", "least"), "place"), "mark": (("image", "place"), "marked")},
+    )
+    images = [np.full((4, 6), level, np.uint8) for level in (10, 200)]
+    runner = ep.CompGraphRunner(cg, {"least": 100})
+    for image in images:
+        runner.run(image=image)
+    found = ep.promote(
+        runner, tmp_path / "b", outputs=["place", "marked"], samples=[{"image": image} for image in images]
+    )
+    assert f"return {nothing}" in (found.path / "pipeline.py").read_text()
+    verify(found.path)
+    loaded = ep.load(found.path)
+    assert [loaded.run(image=image)["place"] for image in images] == [ep.Nothing, 0]
+    assert loaded.run(image=images[0])["marked"] is ep.Nothing
+    assert first_difference(ep.Nothing, None) == "expected type NothingType, got NoneType"
+    assert first_difference(ep.Nothing, ep.Nothing) is None
+
+
+def test_a_replay_that_finds_something_where_nothing_was_recorded_differs(tmp_path):
+    names = notebook(SEARCH.format(nothing="Nothing"))
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"find": names["find"]}, {"find": (("image", "least"), "place")}), {"least": 100}
+    )
+    runner.run(image=np.full((4, 6), 10, np.uint8))
+    found = ep.promote(runner, tmp_path / "b", outputs=["place"])
+    settings = found.path / "pipeline.toml"
+    settings.write_text(settings.read_text().replace("value = 100", "value = 5"))
+    write_manifest(found.path)
+    with pytest.raises(ReplayDiffers, match="expected type NothingType, got int"):
+        verify(found.path)

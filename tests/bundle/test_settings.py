@@ -181,3 +181,9 @@ def test_ranges_and_their_texts_are_written_and_what_only_a_picture_needs_is_lef
         "how": {"value": 1, "choices": [0, 1], "labels": ["FAST", "EXACT"]},
     }  # fmt: skip
     assert read_settings(tmp_path / "pipeline.toml").hyperparameters == values
+
+
+def test_nothing_is_a_value_of_its_own():
+    assert encode_value(ep.Nothing) == {"kind": "nothing"}
+    assert decode_value({"kind": "nothing"}) is ep.Nothing
+    assert decode_value(encode_value([1, ep.Nothing, (ep.Nothing, None)])) == [1, ep.Nothing, (ep.Nothing, None)]

@@ -426,3 +426,69 @@ def test_long_constants_of_the_notebook_stand_as_they_were():
     )
     text = ep.to_source(ep.CompGraph({"f": names["f"]}, {"f": ("x", "y")}))
     assert executed(text)(0) == names["f"](0)
+
+
+NOTHING_CELL = """
+from epypes import Nothing
+
+
+def clipped(x):
+    return x if x < 5 else Nothing
+
+
+def find(x):
+    return clipped(x)
+
+
+def split(x):
+    return ep.Nothing if x == 3 else (x, ep.Nothing if x == 2 else -x)
+
+
+def add(a, b):
+    return a + b
+
+
+def double(y):
+    return 2 * y
+
+
+def show(y):
+    print(y)
+"""
+
+
+def test_what_takes_nothing_is_skipped_as_in_the_graph():
+    names = notebook(NOTHING_CELL)
+    inner = ep.CompGraph({"find": names["find"], "double": names["double"]}, {"find": ("x", "y"), "double": ("y", "z")})
+    functions = {name: names[name] for name in ("find", "split", "add", "double")}
+    io = {"find": ("x", "y"), "split": ("x", ("a", "b")), "add": (("y", "b"), "sum"), "double": ("a", "twice")}
+    cg = ep.CompGraph(
+        {**functions, "inner": ep.Pipeline("inner", inner), "other": names["double"], "always": names["double"]},
+        {**io, "inner": ("x", "i"), "other": ("i", "j"), "always": ("x", "k")},
+    )
+    runner = ep.CompGraphRunner(
+        cg | ep.switch("choose", {"s": "sum", "t": "twice"}, by="how", output="end"), {"how": "s"}
+    )
+    text = ep.to_source(runner)
+    assert "if y is ep.Nothing or b is ep.Nothing:" in text
+    assert "k = double(x)" in text.replace("    ", "")
+    run_graph = executed(text)
+    for how in "st":
+        runner.set(how=how)
+        for x in (1, 2, 3, 4, 5, 9):
+            run = runner.run(x=x)
+            assert run_graph(x, how=how) == tuple(run[token] for token in runner.cg.sink_tokens)
+
+
+def test_a_function_without_outputs_is_called_only_where_something_was_found(capsys):
+    names = notebook(NOTHING_CELL)
+    cg = ep.CompGraph({"find": names["find"], "show": names["show"]}, {"find": ("x", "y"), "show": ("y", None)})
+    run_graph = executed(ep.to_source(cg))
+    for x in (1, 9, 2):
+        run_graph(x)
+    assert capsys.readouterr().out == "1\n2\n"
+
+
+def test_a_hyperparameter_may_be_nothing():
+    assert executed(source_with(ep.Nothing))() is ep.Nothing
+    assert executed(source_with(ep.Nothing))(k=3) == 3

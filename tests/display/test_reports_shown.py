@@ -239,7 +239,7 @@ def test_reports_become_a_table_of_one_row_per_run_and_function():
     runner = ep.CompGraphRunner(
         ep.CompGraph({"f": abs, "g": lambda y, k: y}, {"f": ("x", "y"), "g": (("y", "k"), "z")}), {"k": 1}
     )
-    columns = ["run", "function", "ran", "time_ms", "share", "failed"]
+    columns = ["run", "function", "ran", "time_ms", "share", "failed", "skipped"]
     assert list(runner.reports.to_frame().columns) == columns
     assert len(runner.reports.to_frame()) == 0
     runner.run(x=1)
@@ -314,3 +314,12 @@ def test_the_run_shows_times_that_its_report_has():
     run = branching_runner().run(image=1)
     assert list(bars(run.report))[:-2] == [entry.function for entry in run.report.functions]
     assert math.isclose(sum(run.report.to_frame()["share"]) + run.report.overhead_ns / run.report.total_ns, 1)
+
+
+def test_a_report_says_which_functions_were_skipped():
+    cg = ep.CompGraph({"find": lambda x: ep.Nothing, "mark": abs}, {"find": ("x", "y"), "mark": ("y", "z")})
+    report = ep.CompGraphRunner(cg).run(x=1).report
+    assert "1 function ran, 0 reused, 1 skipped" in mimebundle(report)["text/html"]
+    assert [line.split()[:2] for line in str(report).splitlines() if line.startswith("mark")] == [["mark", "skipped"]]
+    row = report.to_frame().set_index("function").loc["mark"]
+    assert (bool(row["ran"]), float(row["time_ms"]), bool(row["skipped"])) == (False, 0.0, True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import json
 import re
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.layout.placement import lay_out
+from epypes.display.views.graphview import from_json, to_json
 from epypes.run import execute
 from tests.display.test_display import SVG, texts, vertices
 
@@ -411,3 +413,64 @@ def test_a_redefined_function_is_told_on_a_reactive_pipeline_too():
             assert "redefined" in vertices(mimebundle(shown)["image/svg+xml"])["function-blur"].get("class").split()
     finally:
         del sys.modules[module.__name__]
+
+
+# -- nothing found ----------------------------------------------------------------------------------------------------
+
+
+def searched(minimum):
+    cg = ep.CompGraph(
+        {"find": lambda x, minimum: x if x >= minimum else ep.Nothing, "mark": abs, "count": abs},
+        {"find": (("x", "minimum"), "place"), "mark": ("place", "marked"), "count": ("x", "n")},
+    )
+    runner = ep.CompGraphRunner(cg, {"minimum": minimum})
+    runner.run(x=3)
+    return runner
+
+
+def test_what_was_skipped_is_faint_as_a_branch_that_is_not_chosen_and_says_why():
+    runner = searched(5)
+    for shown in (runner, runner.last):
+        found = vertices(to_svg(shown))
+        assert found["function-mark"].get("class") == "function left-out skipped"
+        assert texts(found["function-mark"]) == ["mark", "skipped"]
+        assert found["function-mark"].find(f"{SVG}title").text == "function mark: skipped; 'place': nothing found"
+        for token in ("place", "marked"):
+            assert found[f"token-{token}"].get("class") == "token payload left-out nothing-found"
+            assert texts(found[f"token-{token}"]) == [token, "nothing found"]
+            assert found[f"token-{token}"].find(f"{SVG}title").text == f"token {token}: Nothing, nothing found"
+        graph = view(shown)
+        dead = {
+            (graph.functions[edge.function].name, graph.tokens[edge.token].name)
+            for edge in graph.edges
+            if not edge.is_live
+        }
+        assert dead == {("mark", "place"), ("mark", "marked")}
+        assert found["function-count"].get("class") == "function ran"
+
+
+def test_what_comes_back_is_drawn_as_ever():
+    runner = searched(5)
+    runner.rerun(minimum=2)
+    found = vertices(to_svg(runner))
+    assert found["function-mark"].get("class") == "function ran"
+    assert texts(found["token-marked"]) == ["marked", "3"]
+    runner["minimum"] = 7
+    assert vertices(to_svg(runner))["function-mark"].get("class") == "function stale"
+    runner.rerun()
+    runner["minimum"] = 1
+    assert texts(vertices(to_svg(runner))["token-place"]) == ["place", "nothing found"]
+    assert vertices(to_svg(runner))["token-place"].get("class") == "token payload stale"
+
+
+def test_a_view_with_skipped_functions_goes_through_json():
+    graph = view(searched(5))
+    assert from_json(json.loads(json.dumps(to_json(graph)))) == graph
+
+
+def test_a_group_of_skipped_functions_is_skipped():
+    runner = searched(5)
+    cg = ep.group(runner.cg, "marking", functions=["mark"])
+    grouped = ep.CompGraphRunner(cg, {"minimum": 5})
+    grouped.run(x=3)
+    assert {each.name: each.state for each in view(grouped).functions}["marking"] == "skipped"

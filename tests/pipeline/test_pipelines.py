@@ -527,3 +527,37 @@ def test_a_signal_handler_that_puts_never_makes_a_mailbox_hold_more_than_its_siz
 def test_a_token_may_be_called_self():
     cg = ep.CompGraph({"f": lambda x: x}, {"f": ("self", "y")})
     assert ep.Pipeline("p", cg).run(self=3)["y"] == 3
+
+
+def test_f_out_gets_nothing_where_nothing_was_found():
+    cg = ep.CompGraph(
+        {"find": lambda x: x if x > 2 else ep.Nothing, "double": lambda y: 2 * y, "count": lambda x: x + 1},
+        {"find": ("x", "y"), "double": ("y", "z"), "count": ("x", "n")},
+    )
+    q_in, q_out = queue.Queue(), queue.Queue()
+    seen = []
+
+    def f_out(view):
+        seen.append((view["y"], "z" in view, view.report.skipped))
+        return "lost" if view["z"] is ep.Nothing else view["z"]
+
+    with ep.FullPipeline("search", cg, q_in, q_out, lambda event: {"x": event}, f_out) as pipe:
+        for event in (3, 1, ep.Nothing, 4):
+            q_in.put(event)
+        assert [q_out.get(timeout=TIMEOUT_S) for _ in range(4)] == [6, "lost", "lost", 8]
+    assert seen[1] == (ep.Nothing, True, ("double",))
+    assert seen[2] == (ep.Nothing, True, ("find", "double", "count"))
+    assert [pipe.network.nodes[name].run_count for name in ("find", "double", "count")] == [3, 2, 3]
+
+
+def test_nodes_that_were_skipped_count_in_no_time():
+    cg = ep.CompGraph(
+        {"find": lambda x: x if x > 2 else ep.Nothing, "double": lambda y: 2 * y},
+        {"find": ("x", "y"), "double": ("y", "z")},
+    )
+    pipe = ep.Pipeline("search", cg)
+    assert pipe(3) == 6
+    assert pipe(1) is ep.Nothing
+    name, total, (found, doubled) = pipe.traverse_time()
+    assert (name, found[0], doubled) == ("search", "find", ("double", 0.0))
+    assert pipe.compute_overhead() == pytest.approx(total - found[1])

@@ -1,8 +1,9 @@
 """After any sequence of edits, what can be read equals a run from scratch, and nothing ran in vain.
 
 A machine edits, runs and reads a random graph beside a model of a few lines: a dictionary of values, each with a
-version, and for each function the versions that it last ran with. Values are integers and None; functions have any
-number of inputs and outputs, fail now and then, are switches or placeholders.
+version, and for each function the versions that it last ran with. Values are integers, None and Nothing; functions have
+any number of inputs and outputs, fail now and then, find nothing, are switches or placeholders. A function that is given
+Nothing is not called.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from epypes.run import execute
 from epypes.run.program import Program
 from epypes.run.staleness import TokenManager
 
-NOTHING = object()
+NOT_COMPUTED = object()
 VALUES = st.integers(0, 4)
 
 
 class Recorded:
-    """A function of integers and None that counts its calls; fails on some inputs, passes some values through."""
+    """A function of integers and None that counts its calls; fails on some inputs, and finds nothing on others."""
 
     def __init__(self, index: int, outputs: int, fails: bool):
         self.index, self.outputs, self.fails = index, outputs, fails
@@ -44,10 +45,16 @@ class Recorded:
         )
         if self.fails and total % 5 == 0:
             raise ArithmeticError(total)
-        values = tuple(None if (total + place) % 7 == 0 else (total + place) % 4 for place in range(self.outputs))
+        if total % 11 == 0:
+            return ep.Nothing
+        values = tuple(self.value(total + place) for place in range(self.outputs))
         return values if self.outputs != 1 else values[0]
 
+    def value(self, number):
+        return None if number % 7 == 0 else ep.Nothing if number % 6 == 0 else number % 4
+
     def __call__(self, *args):
+        assert ep.Nothing not in args
         self.calls += 1
         return self.compute(*args)
 
@@ -87,7 +94,7 @@ class Model:
         self.count = itertools.count(1)
 
     def put(self, token, value):
-        if token not in self.values or self.values[token] is NOTHING or self.values[token] != value:
+        if token not in self.values or self.values[token] is NOT_COMPUTED or self.values[token] != value:
             self.values[token], self.versions[token] = value, next(self.count)
 
     def reads(self, name):
@@ -134,23 +141,27 @@ class Model:
         for name in wanted:
             if self.ran.get(name) == self.used(name):
                 continue
-            called.append(name)
             function, inputs = self.cg.functions[name], [self.values[token] for token in self.reads(name)]
-            try:
-                made = inputs[1] if name in self.cg.switches else function.compute(*inputs)
-            except ArithmeticError:
-                self.forget(name)
-                return called, True
             outputs = self.cg.func_outputs(name)
+            if ep.Nothing in inputs:
+                made = ep.Nothing
+            else:
+                called.append(name)
+                try:
+                    made = inputs[1] if name in self.cg.switches else function.compute(*inputs)
+                except ArithmeticError:
+                    self.forget(name)
+                    return called, True
             self.ran[name] = self.used(name)
-            for token, value in zip(outputs, (made,) if len(outputs) == 1 else made, strict=True):
+            made = [made] * len(outputs) if made is ep.Nothing or len(outputs) == 1 else made
+            for token, value in zip(outputs, made, strict=True):
                 self.put(token, value)
         return called, False
 
     def forget(self, name):
         self.ran.pop(name, None)
         for token in self.cg.func_outputs(name):
-            self.values[token] = NOTHING
+            self.values[token] = NOT_COMPUTED
             for reader in self.cg.digraph.consumers.get(token, ()):
                 if token in self.reads(reader):
                     self.forget(reader)
@@ -183,7 +194,7 @@ class Machine(RuleBasedStateMachine):
     def draw_value(self, data, token):
         if token in self.selectors:
             return data.draw(st.integers(0, self.selectors[token] - 1))
-        return data.draw(st.one_of(VALUES, st.none()))
+        return data.draw(st.one_of(VALUES, st.none(), st.just(ep.Nothing)))
 
     def draw_targets(self, data):
         return data.draw(st.lists(st.sampled_from(self.cg.tokens), max_size=2)) if self.cg.tokens else []
@@ -218,7 +229,15 @@ class Machine(RuleBasedStateMachine):
             # Others may have been called beside the one that failed; what they made is dropped.
             calls = {name: count if name in called else max(count - 1, 0) for name, count in calls.items()}
         assert calls == {name: int(name in called) for name in calls}
-        assert self.runner.last.report.ran == tuple(called)
+        report = self.runner.last.report
+        assert report.ran == tuple(called)
+        if not failed:
+            # Of those that were wanted; others may have been skipped in an earlier run.
+            skipped = [
+                name for name in wanted if ep.Nothing in [self.model.values[token] for token in self.model.reads(name)]
+            ]
+            assert report.skipped == tuple(skipped)
+            assert not {*report.skipped} & {*report.ran, *report.reused}
 
     @rule(data=st.data())
     def run(self, data):
@@ -312,7 +331,7 @@ def test_side_by_side_ends_as_one_after_another(graph, data):
     cg = ep.CompGraph(functions, io)
     program = Program(cg, True)
     values = [
-        0 if token in selectors else data.draw(VALUES) if program.makers[slot] < 0 else NOTHING
+        0 if token in selectors else data.draw(VALUES) if program.makers[slot] < 0 else NOT_COMPUTED
         for slot, token in enumerate(cg.tokens)
     ]
     ends = []

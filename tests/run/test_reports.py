@@ -158,12 +158,12 @@ def test_tables_of_reports_say_what_failed():
     with pytest.raises(TypeError):
         runner.rerun(n="one")
     table = runner.reports[-1].to_frame()
-    assert list(table.columns) == ["function", "ran", "time_ms", "share", "failed"]
+    assert list(table.columns) == ["function", "ran", "time_ms", "share", "failed", "skipped"]
     assert table[["function", "ran", "failed"]].values.tolist() == [
         ["f0", False, False], ["f1", True, True], ["beside", False, False],
     ]  # fmt: skip
     table = runner.reports.to_frame()
-    assert list(table.columns) == ["run", "function", "ran", "time_ms", "share", "failed"]
+    assert list(table.columns) == ["run", "function", "ran", "time_ms", "share", "failed", "skipped"]
     assert table[table["failed"]][["run", "function"]].values.tolist() == [[1, "f1"]]
 
 

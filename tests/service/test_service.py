@@ -369,3 +369,38 @@ def test_the_colours_of_rgb_tokens_survive_the_way_through_a_service(local, tmp_
         (answer,) = peer.take()
     assert answer.rgb == {"red"}
     assert np.array_equal(answer.parts["red"], runner["red"]), "what came as BGR was converted"
+
+
+SEARCHING = '''
+    """A function that may find nothing."""
+
+    import epypes as ep
+
+
+    def find(x):
+        return x if x > 2 else ep.Nothing
+
+
+    def double(y):
+        return 2 * y
+
+
+    func_dict = {"find": find, "double": double}
+    func_io = {"find": ("x", "y"), "double": ("y", "z")}
+'''
+
+
+def test_a_service_answers_nothing_where_nothing_was_found(tmp_path):
+    sample = ({"x": 1}, {"y": ep.Nothing, "z": ep.Nothing})
+    bundle = written_bundle(tmp_path / "search", SEARCHING, ["x"], ["y", "z"], sample=sample)
+    with StateLock(bundle) as lock, Service(bundle, ANY, ANY) as service:
+        lock.publish(service.start())
+        with Client(bundle) as client:
+            answers = [client.call({"x": x}) for x in (3, 1, ep.Nothing)]
+        assert [answer.tokens["z"] for answer in answers] == [6, ep.Nothing, ep.Nothing]
+        assert [[*answer.timings_ns] for answer in answers] == [["find", "double"], ["find"], []]
+        assert service.counts()["failed"] == 0
+        lines = run_cli("call", bundle, "x=1", "--out", f"z={tmp_path}/z.png").stdout.splitlines()
+        assert lines[:2] == ["y = Nothing", f"z = Nothing: {tmp_path}/z.png is not written"]
+        assert not (tmp_path / "z.png").exists()
+        assert run_cli("call", bundle, "x=5").stdout.splitlines()[:2] == ["y = 5", "z = 10"]

@@ -91,3 +91,22 @@ def test_the_big_picture_has_the_colours_that_the_annotations_say() -> None:
         picture = np.asarray(Image.open(io.BytesIO(make_frame(run, token, 1, Shown(token)).buffers[0])))
         strongest[token] = int(picture.reshape(-1, 3).mean(axis=0).argmax())
     assert strongest == {"image": 0, "red": 0, "unsaid": 2}
+
+
+def test_where_nothing_is_found_a_text_takes_the_place_of_the_last_picture() -> None:
+    functions = {
+        "find": lambda image, least: image if image.max() >= least else ep.Nothing,
+        "mark": lambda image: image,
+    }
+    cg = ep.CompGraph(functions, {"find": (("image", "least"), "found"), "mark": ("found", "marked")})
+    runner = ep.CompGraphRunner(cg, {"least": 100})
+    runner.run(image=np.full((20, 30), 200, np.uint8))
+    shown, had = Shown("marked", pinned=("found",), has_histogram=True), {"image", "found", "marked"}
+    assert make_frame(runner.last, "marked", 1, shown, had_pictures=had).content["pictures"][0]["width"] == 30
+    made = make_frame(runner.rerun(least=250), "marked", 2, shown, had_pictures=had)
+    assert [picture["text"] for picture in made.content["pictures"]] == [
+        "marked: nothing found.",
+        "found: nothing found.",
+    ]
+    assert (made.content["ran"], made.content["reused"], made.content["skipped"], made.buffers) == (1, 0, 1, ())
+    assert made.content["histogram"] is None

@@ -491,3 +491,21 @@ def test_writing_back_is_asked_of_a_service_alone(runner: ep.CompGraphRunner, mo
     assert screen.last("setup")["writes_back"] is False
     assert screen.last("written")["text"] == "Not written: a runner has no bundle to write to. Promote it."
     panel.close(TIMEOUT_S)
+
+
+def test_a_service_that_has_found_nothing_shows_what_it_skipped(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    functions = {
+        "find": lambda image, least: image if image.max() >= least else ep.Nothing,
+        "mark": lambda image: image,
+    }
+    cg = ep.CompGraph(functions, {"find": (("image", "least"), "found"), "mark": ("found", "marked")})
+    service = Standing(ep.CompGraphRunner(cg, {"least": 100}), tmp_path, outputs=("marked",))
+    service.event(image=np.full((20, 30), 10, np.uint8))
+    with standing(service) as server, ep.connect(f"{server.url}#token={server.token}") as connection:
+        panel = tune(connection, token="marked")
+        panel.wait(TIMEOUT_S)
+        frame = FrontEnd(panel, monkeypatch).last("frame")
+        assert frame["pictures"][0]["text"] == "marked: nothing found."
+        assert (frame["stages"]["marked"], frame["ran"], frame["skipped"]) == ("nothing", 1, 1)
+        assert panel.result["marked"] is ep.Nothing
+        panel.close(TIMEOUT_S)

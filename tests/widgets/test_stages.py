@@ -112,3 +112,14 @@ def test_what_a_function_failed_to_make_is_failed(runner: Any) -> None:
         runner.rerun(quality=2.0)
     said = states(runner.last, found)
     assert said == {"image": "fresh", "blurred": "fresh", "corners": "failed", "count": "absent"}
+
+
+def test_a_stage_for_which_nothing_was_found_says_so_and_keeps_its_place() -> None:
+    functions = {"mark": lambda image, least: image if image.max() >= least else ep.Nothing, "blur": blurred}
+    cg = ep.CompGraph(functions, {"mark": (("image", "least"), "marked"), "blur": (("marked", "sigma"), "blurred")})
+    runner = ep.CompGraphRunner(cg, {"least": 100, "sigma": 1.0})
+    before = stages(runner.run(image=square()))
+    run = runner.rerun(least=250)
+    assert stages(run, before) == before
+    assert states(run, before) == {"image": "fresh", "marked": "nothing", "blurred": "nothing"}
+    assert states(runner.rerun(least=100), before) == dict.fromkeys(("image", "marked", "blurred"), "fresh")

@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import epypes as ep
 from epypes.errors import MessageError
 from epypes.wire import Envelope, Limits, decode, encode, load_sample, save_sample
 
@@ -202,3 +203,13 @@ def test_importing_wire_imports_neither_protobuf_nor_numpy():
         "sys.exit(any(n in sys.modules for n in ('numpy', 'google.protobuf')))"
     )
     assert subprocess.run([sys.executable, "-c", script], timeout=60).returncode == 0
+
+
+def test_nothing_comes_back_as_itself_wherever_it_stands(tmp_path):
+    values = {"place": ep.Nothing, "places": [(1, 2), ep.Nothing], "by name": {"a": ep.Nothing, "b": None}}
+    envelope = decode([bytes(frame) for frame in encode(Envelope("t", parts=values, attributes={"why": ep.Nothing}))])
+    assert envelope.parts == values
+    assert envelope.parts["place"] is envelope.parts["places"][1] is envelope.attributes["why"] is ep.Nothing
+    save_sample(tmp_path / "s.npz", {"place": ep.Nothing}, values)
+    inputs, outputs = load_sample(tmp_path / "s.npz")
+    assert (inputs["place"], outputs) == (ep.Nothing, values)

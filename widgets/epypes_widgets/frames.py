@@ -84,7 +84,7 @@ def make_frame(
     changed_ns
         When the newest of its values was set.
     had_pictures
-        The tokens that have had a picture: where nothing is found any more, the image without marks is left.
+        The tokens that have had a picture: where there are no marks any more, the image without them is left.
     content
         Is sent as it is.
     """
@@ -103,6 +103,7 @@ def make_frame(
         "times_ms": {name: ns / 1e6 for name, ns in report.durations_ns.items()},
         "ran": len(report.ran),
         "reused": len(report.reused),
+        "skipped": len(report.skipped),
         "pictures": [described for described, _ in pictures],
         "histogram": histogram_of(run, token) if shown.has_histogram else None,
         "histograms": {cut: histogram_of(run, cut) for cut in shown.cut} if shown.has_histogram else {},
@@ -118,7 +119,7 @@ def picture(
     found = scene(run, token, had_marks=token in had_pictures)
     described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
     if found is None:
-        text = text_of(run[token]) if token in run else f"{token} has not been computed with these values."
+        text = _text_in_place(run, token)
         return {**described, "media_type": "text/plain", "text": text}, b""
     image = found.backdrop.image
     encoded = encode_image(image, max_side_px, found.backdrop.order, found.backdrop.ends)
@@ -133,6 +134,13 @@ def picture(
         "dtype": str(image.dtype),
     }
     return described, encoded.data
+
+
+def _text_in_place(run: Run, token: str) -> str:
+    """Return what stands in the place of a picture."""
+    if token not in run:
+        return f"{token} has not been computed with these values."
+    return f"{token}: nothing found." if run.tokens.is_nothing(token) else text_of(run[token])
 
 
 def text_of(value: Any) -> str:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _CHANNELS: Final = {"bgr": "BGRA", "rgb": "RGBA"}
 
-State = Literal["fresh", "stale", "failed", "absent"]
+State = Literal["fresh", "stale", "failed", "absent", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,8 @@ def best_stage(run: Run, stages: Iterable[Stage]) -> str | None:
 def states(run: Run, stages: Iterable[Stage]) -> dict[str, State]:
     """Return the state of every stage.
 
-    ``"failed"`` is what the function that failed would have made, ``"absent"`` what was not computed.
+    ``"failed"`` is what the function that failed would have made, ``"absent"`` what was not computed,
+    ``"nothing"`` that for which nothing was found.
     """
     return {stage.token: _state(run, stage.token) for stage in stages}
 
@@ -102,7 +103,9 @@ def _state(run: Run, token: str) -> State:
         return "failed"
     if not run.tokens.is_computed(token):
         return "fresh" if run.failure is None and _was_in(run, token, maker) else "absent"
-    return "stale" if run.tokens.is_stale(token) else "fresh"
+    if run.tokens.is_stale(token):
+        return "stale"
+    return "nothing" if run.tokens.is_nothing(token) else "fresh"
 
 
 def _was_in(run: Run, token: str, maker: str | None) -> bool:

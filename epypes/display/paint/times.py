@@ -79,7 +79,7 @@ def report_times(report: RunReport, most: int = MOST_BARS) -> TimesView:
     kept, rest = {entry.function for entry in longest[:most]}, longest[most:]
     bars = [_function_bar(entry, total_ns) for entry in entries if entry.function in kept]
     if rest:
-        text = f"{counted(len(rest), 'function')} more, {sum(not entry.ran for entry in rest)} of them reused"
+        text = f"{counted(len(rest), 'function')} more, {sum(entry.reused for entry in rest)} of them reused"
         bars.append(_bar("rest", text, sum(entry.duration_ns for entry in rest), total_ns))
     bars.append(_bar("overhead", overhead_text(report.side_by_side), report.overhead_ns, total_ns))
     scale = max((bar.length for bar in bars), default=0.0) or 1.0
@@ -95,17 +95,18 @@ def report_times(report: RunReport, most: int = MOST_BARS) -> TimesView:
 
 
 def _report_caption(entries: tuple[FunctionTime, ...]) -> str:
-    """Return how many functions of a run ran to their end, how many were reused, and whether one failed."""
-    failed = sum(entry.failed for entry in entries)
-    reused = sum(not entry.ran for entry in entries)
-    ran = counted(len(entries) - reused - failed, "function")
-    return f"{ran} ran, {reused} reused{f', {failed} failed' * failed}"
+    """Return how many functions of a run ran to their end, how many were reused or skipped, and whether one failed."""
+    failed, skipped = sum(entry.failed for entry in entries), sum(entry.skipped for entry in entries)
+    reused = sum(entry.reused for entry in entries)
+    ran = counted(sum(entry.ran for entry in entries) - failed, "function")
+    return f"{ran} ran, {reused} reused{f', {skipped} skipped' * bool(skipped)}{f', {failed} failed' * failed}"
 
 
 def _function_bar(entry: FunctionTime, total_ns: int) -> TimeBar:
     named = _named("function", entry.function)
     if not entry.ran:
-        return TimeBar("function", entry.function, "reused", f"{named}: reused", ("reused", ""), is_reused=True)
+        text = "skipped" if entry.skipped else "reused"
+        return TimeBar("function", entry.function, text, f"{named}: {text}", (text, ""), is_reused=True)
     bar = _bar("function", entry.function, entry.duration_ns, total_ns)
     if not entry.failed:
         return bar

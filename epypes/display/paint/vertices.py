@@ -91,6 +91,11 @@ def _vertex_id(kind: str, name: str) -> str:
     return f"{kind}-{plain}"
 
 
+def _classes(state: str) -> tuple[str, ...]:
+    """Return the classes of a state: what is skipped looks like what is left out."""
+    return ("left out", state) if state in ("skipped", "nothing found") else (state,)
+
+
 def _polygon(points: Sequence[Point]) -> str:
     return f'<polygon class="shape" points="{" ".join([f"{x:.0f},{y:.0f}" for x, y in points])}"/>'
 
@@ -162,7 +167,7 @@ def paint_function(function: FunctionView, box: Box, centre: Point, direction: D
     text = "; ".join(filter(None, (_state_text(function), *function.notes, function.message)))
     title = f"{function.kind} {cut_name(function.name, _TITLE_CHARACTERS)}: {text}"
     kind = () if function.kind == "function" else (function.kind,)
-    states = (*kind, *(("redefined",) if function.is_redefined else ()), function.state)
+    states = (*kind, *(("redefined",) if function.is_redefined else ()), *_classes(function.state))
     more = _FAILURE_CHARACTERS if function.state == "failed" else 0
     return vertex("function", function.name, states, title, body, more=more)
 
@@ -274,7 +279,7 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
         # A dot, since a line of text would change the size of the box with the value.
         body += f'<circle class="dot" cx="{x + box.width - 11:.0f}" cy="{y + 3:.0f}" r="3.5"/>'
         state += f", first {token.first}"
-    states = (token.role, token.state, *(("changed",) if token.first else ()))
+    states = (token.role, *_classes(token.state), *(("changed",) if token.first else ()))
     noun = "hyperparameter token" if token.role == "hyperparameter" else "token"
     title = f"{noun} {cut_name(token.name, _TITLE_CHARACTERS)}{state}"
     return vertex("token", token.name, states, title, body, thumbnail)

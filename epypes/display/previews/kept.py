@@ -16,6 +16,7 @@ from epypes.display.previews.introspection import kind_name
 from epypes.display.previews.model import Look, Preview, Sketch
 from epypes.display.previews.preview import finished_in_context, sketch_in_context
 from epypes.display.previews.registry import is_shown_by_user, users_revision
+from epypes.nothing import NothingType
 from epypes.run import CompGraphRunner, Run
 from epypes.run.program import Program
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from epypes.display.previews.model import Array
 
 
-_SCALARS: Final = frozenset({int, float, complex, bool, type(None)})
+_SCALARS: Final = frozenset({int, float, complex, bool, type(None), NothingType})
 _SHORT_TEXT: Final = 200
 
 

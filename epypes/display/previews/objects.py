@@ -17,6 +17,7 @@ from epypes.display.previews.model import Look, Preview, Sketch
 from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items
 from epypes.display.text import cut, memory_text
+from epypes.nothing import NothingType
 from epypes.wording import counted
 
 _MOST_ROWS: Final = 4
@@ -33,6 +34,11 @@ def _plain(value: Any, look: Look) -> Preview:
     count = length_of(value)
     size = f" of {count}" if count > len(short) else ""
     return Preview(short, f"{_name(value)}{size} {short}")
+
+
+@built_in(NothingType)
+def _nothing(value: NothingType, look: Look) -> Preview:
+    return Preview("nothing found", "Nothing")
 
 
 @built_in(float)

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 from epypes.display.previews.introspection import dotted_name, kind_name, parents
 from epypes.display.previews.model import Look
-from epypes.run.guard import lend
+from epypes.run.guard import lend_to_reader
 
 _Function = TypeVar("_Function", bound=Callable[[Any], Any])
 # What a preview function may return is checked where it is called.
@@ -119,5 +119,5 @@ def register_preview(kind: type | str, function: Callable[[Any], Any] | None = N
     if not callable(function):
         raise TypeError(f"The preview of {kind!r} must be a function that takes the value, not {function!r:.60}.")
     # As for the functions of a graph: what is shown can't be spoilt.
-    _users.add(kind, lambda value, look: function(lend(value)))
+    _users.add(kind, lambda value, look: function(lend_to_reader(value)))
     return function

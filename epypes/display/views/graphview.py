@@ -18,10 +18,10 @@ from epypes.images import Order
 _MOST_EDGES: Final = 10
 
 TokenRole = Literal["payload", "hyperparameter"]
-TokenState = Literal["static", "not computed", "fresh", "stale", "missing", "left out"]
+TokenState = Literal["static", "not computed", "fresh", "stale", "nothing found", "missing", "left out"]
 FunctionKind = Literal["function", "pipeline", "switch", "placeholder", "group"]
 FunctionState = Literal[
-    "static", "not run", "running", "ran", "reused", "stale", "failed", "planned", "missing", "left out"
+    "static", "not run", "running", "ran", "reused", "skipped", "stale", "failed", "planned", "missing", "left out"
 ]
 
 
@@ -54,7 +54,7 @@ class FunctionView(NamedTuple):
     share
         Its part of the run's time, from 0 to 1.
     message
-        Why it failed, would run or is left out.
+        Why it failed, was skipped, would run or is left out.
     notes
         Short lines that are true of it in any state: the branch that a switch has chosen, that it is to be written, how
         many functions are inside a pipeline.
@@ -103,7 +103,8 @@ class EdgeView(NamedTuple):
     is_input
         Whether the function takes the token, not makes it.
     is_live
-        Whether a run uses it. A switch reads the chosen branch only, and none as long as none is chosen.
+        Whether a run uses it. A switch reads the chosen branch only, and none as long as none is chosen; a skipped
+        function uses none.
     """
 
     function: int

@@ -21,7 +21,7 @@ _LEAST_SHARED: Final = 3
 _REDEFINED: Final = "redefined inside: build again"
 # The state of a group is the first of these that one of its functions is in.
 _BY_WEIGHT: Final[tuple[FunctionState, ...]] = (
-    "failed", "running", "missing", "stale", "planned", "ran", "reused", "not run", "static", "left out",
+    "failed", "running", "missing", "stale", "planned", "ran", "reused", "skipped", "not run", "static", "left out",
 )  # fmt: skip
 
 

@@ -143,7 +143,8 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
     most
         How many marks there are at most; without, as many as on a thumbnail.
     had_marks
-        Whether an earlier value of the token had marks: where nothing is found any more, the image alone is left.
+        Whether an earlier value of the token had marks: where there are none any more, the image alone is left. Nothing
+        has no picture.
 
     Returns
     -------
@@ -160,7 +161,7 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
     ('image', 'points', [[20.0, 10.0], [30.0, 10.0]])
     """
     program, tokens = run.tokens.program, run.tokens
-    if not tokens.is_computed(token) or tokens.is_stale(token):
+    if not tokens.is_computed(token) or tokens.is_stale(token) or tokens.is_nothing(token):
         return None
     value, order = tokens.values[program.slots[token]], colour_order(run.cg, token)
     if is_image(value):

@@ -165,29 +165,40 @@ def _run_view(
     closed: Mapping[str, Sequence[str]],
 ) -> GraphView:
     """Add a run to a graph's structure; ``stale`` are functions out of date since the run."""
-    steps, report = run.tokens.program.steps, run.report
-    stale |= {steps[index].name for index in run.tokens.stale}
+    program, report = run.tokens.program, run.report
+    stale |= {program.steps[index].name for index in run.tokens.stale}
     seen = outside_tokens(structure, closed) if closed else ()
     producer = run.cg.digraph.producer
 
     def state_of(token: str) -> TokenState:
         if not run.tokens.is_computed(token):
             return "not computed"
-        return "stale" if producer.get(token) in stale else "fresh"
+        if producer.get(token) in stale:
+            return "stale"
+        return "nothing found" if run.tokens.is_nothing(token) else "fresh"
 
     tokens, dropped = token_views(structure, hparams, state_of, room, seen, run)
     overhead = f"{overhead_text(report.side_by_side)} {duration_text(report.overhead_ns)}"
     caption = f"{duration_text(report.total_ns)} in all, {overhead}"
     if dropped:
         caption += f"; {dropped} thumbnails left out to keep the picture small"
-    function_view = _run_function_view(run, stale)
-    return _captioned(structure, caption, functions=tuple(map(function_view, structure.functions)), tokens=tokens)
+    functions = tuple(map(_run_function_view(run, stale), structure.functions))
+    edges = (
+        tuple(
+            edge._replace(is_live=False) if functions[edge.function].state == "skipped" else edge
+            for edge in structure.edges
+        )
+        if program.has_skipped
+        else structure.edges
+    )
+    return _captioned(structure, caption, functions=functions, tokens=tokens, edges=edges)
 
 
 def _run_function_view(run: Run, stale: Collection[str]) -> Callable[[FunctionView], FunctionView]:
     report, failure = run.report, run.failure
     entries: Mapping[str, FunctionTime] = {entry.function: entry for entry in report.functions}
     total_ns = max(report.total_ns, 1)
+    lacking = run.tokens.lacking() if report.skipped else {}
 
     def function_view(function: FunctionView) -> FunctionView:
         name, entry = function.name, entries.get(function.name)
@@ -200,6 +211,8 @@ def _run_function_view(run: Run, stale: Collection[str]) -> Callable[[FunctionVi
             made = run.cg.func_outputs(name)
             is_new = made and not any(map(run.tokens.is_computed, made))
             return function._replace(state="not run" if is_new else "stale")
+        if entry is not None and entry.skipped:
+            return function._replace(state="skipped", message=f"{', '.join(map(repr, lacking[name]))}: nothing found")
         if entry is None or not entry.ran:
             return function._replace(state="reused")
         share = entry.duration_ns / total_ns

@@ -1,7 +1,13 @@
 // The stages as tabs: which is shown, which are pinned, and the state of each.
 import { element, icon, note, say, walkAlong } from "./elements.js";
 
-const STATES = { fresh: ["", ""], stale: ["stale", "~"], failed: ["failed", "!"], absent: ["not computed", "○"] };
+const STATES = {
+  fresh: ["", ""],
+  stale: ["stale", "~"],
+  failed: ["failed", "!"],
+  absent: ["not computed", "○"],
+  nothing: ["nothing found", "∅"],
+};
 
 /** A tab for every token that can be looked at; each picture with a pin. */
 export function chipsPart(panel) {

@@ -44,7 +44,7 @@ function headerPart() {
       say(token, frame.token);
       say(kind, main.shape ? `${main.dtype} ${main.shape}` : "");
       say(marks, overlayCount(main.overlay));
-      say(count, `${frame.ran} ran, ${frame.reused} reused`);
+      say(count, `${frame.ran} ran, ${frame.reused} reused${frame.skipped ? `, ${frame.skipped} skipped` : ""}`);
       note(count, "title", Object.entries(frame.times_ms).map(([name, ms]) => `${name}: ${inMs(ms)}`).join("\n"));
       compute_ms = frame.compute_ms;
       tellTimes(frame.to_screen_ms);
