@@ -20,6 +20,7 @@ from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError, UnknownName
 
 if TYPE_CHECKING:
+    from epypes.bundle.settings import Settings
     from epypes.images import Order
     from epypes.service import Answer
 
@@ -57,6 +58,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     from epypes.bundle.manifest import SETTINGS, check_manifest
     from epypes.bundle.settings import read_settings
     from epypes.display.previews.preview import preview
+    from epypes.images import has_colours
     from epypes.service import Client
 
     check_manifest(bundle)
@@ -64,18 +66,33 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     inputs = _by_token(images, settings.inputs, "input")
     files = _by_token(out, settings.outputs, "output")
     payload = {token: _read(text, settings.order(token)) for token, text in inputs.items()}
+    coloured = [token for token, text in inputs.items() if has_colours(payload[token]) and Path(text).exists()]
     with Client(bundle, **options) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
+    pictures = (token for token, file in files.items() if Path(file).suffix != ".npy")
+    written = [token for token in pictures if has_colours(answer.tokens[token])]
+    _warn_of_assumed(settings, [*coloured, *written])
     for token, file in files.items():
         _write(file, answer.tokens[token], settings.order(token))
     if as_json:
         click.echo(json.dumps(asdict(replace(answer, tokens={}))))
         return
+    for token in coloured:
+        click.echo(f"{token} = {inputs[token]}, read as {settings.colour(token)}")
     for token, value in answer.tokens.items():
         if token not in files:
             click.echo(f"{token} = {preview(value).text}")
     _print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
+
+
+def _warn_of_assumed(settings: Settings, tokens: Sequence[str]) -> None:
+    """Print one line if the order of the colours in a file is assumed."""
+    assumed = [token for token in tokens if settings.colour(token).is_assumed]
+    if assumed:
+        names = ", ".join(map(repr, assumed))
+        text = f"Warning: no function says the order of the colours of {names}; the file is read or written as bgr."
+        click.echo(f'{text} If it is rgb, mark it in the notebook with ep.Image(order="rgb"), and promote.', err=True)
 
 
 def _print_answer(title: str, answer: Answer) -> None:

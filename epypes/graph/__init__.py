@@ -11,7 +11,7 @@ from epypes.graph.algebra import (
     with_defaults,
     with_functions,
 )
-from epypes.graph.colours import ColourOrder, colour_order
+from epypes.graph.colours import ASSUMED, ColourOrder, colour_order
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.identity import inner_graph, is_redefined_inside, redefined, unwrapped
 from epypes.graph.placeholder import Placeholder, is_placeholder
@@ -20,6 +20,7 @@ from epypes.graph.switch import Switch, as_switch, switch
 from epypes.graph.token_annotations import annotated_params, image_hint
 
 __all__ = [
+    "ASSUMED",
     "ColourOrder",
     "CompGraph",
     "Placeholder",

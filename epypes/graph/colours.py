@@ -47,10 +47,8 @@ class ColourOrder:
 
     Examples
     --------
-    >>> print(ColourOrder("bgr")), print(ColourOrder("rgb", "gray", "takes", "image"))
-    bgr, assumed
-    rgb, as 'gray' takes 'image'
-    (None, None)
+    >>> str(ColourOrder("bgr")), str(ColourOrder("rgb", "gray", "takes", "image"))
+    ('bgr, assumed', "rgb, as in function 'gray'")
     """
 
     order: Order
@@ -66,15 +64,17 @@ class ColourOrder:
         return not self.function
 
     def __str__(self) -> str:
-        reason = "assumed" if self.is_assumed else f"as {self.function!r} {self.verb} {self.token!r}"
-        return f"{self.order}, {reason}"
+        return f"{self.order}, assumed" if self.is_assumed else f"{self.order}, as in function {self.function!r}"
+
+
+# What the order is where nothing says it, as in OpenCV.
+ASSUMED: Final = ColourOrder("bgr")
 
 
 def colour_order(cg: CompGraph, token: str) -> Order:
     """Return what three and four channels of a token are: BGR, unless a function says otherwise."""
     cg.require_token(token)
-    found = cg.colours.get(token)
-    return "bgr" if found is None else found.order
+    return cg.colours.get(token, ASSUMED).order
 
 
 def find_orders(
