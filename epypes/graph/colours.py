@@ -210,7 +210,7 @@ class _Search:
         for name in (*around, *self._digraph.consumers.get(token, ())):
             for made, seen in self._outputs(name):
                 if isinstance(seen, Passed):
-                    for taken in self._input(name, seen.place):
+                    for taken in self._digraph.inputs[name][seen.place : seen.place + 1]:
                         if made != taken and token in (made, taken):
                             yield taken if token == made else made, seen.is_swapped
 
