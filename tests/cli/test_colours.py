@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import cv2
 import numpy as np
 import pytest
@@ -43,6 +41,14 @@ def score(paint, edge_image):
     return float(paint[edge_image > 0].mean())
 
 
+def paint_by_column(paint):
+    return paint.mean(axis=0)
+
+
+def mean_line(segments):
+    return {"from": segments[:, :2].mean(axis=0), "to": segments[:, 2:].mean(axis=0)}
+
+
 def overlay(image, segments):
     drawn = np.copy(image)
     for x0, y0, x1, y1 in segments.tolist():
@@ -55,6 +61,8 @@ IO = {
     "edges": (("grey", "low", "high"), "edge_image"),
     "lines": ("edge_image", "segments"),
     "score": (("paint", "edge_image"), "score"),
+    "paint_by_column": ("paint", "columns"),
+    "mean_line": ("segments", "line"),
     "overlay": (("image", "segments"), "drawing"),
 }
 
@@ -76,7 +84,10 @@ def lane(photo, tmp_path_factory):
     run = runner.run(image=photo[1])
     lines = []
     bundle = ep.promote(
-        runner, tmp_path_factory.mktemp("bundles") / "lane", outputs=["score", "drawing"], on_progress=lines.append
+        runner,
+        tmp_path_factory.mktemp("bundles") / "lane",
+        outputs=["score", "columns", "line", "drawing"],
+        on_progress=lines.append,
     )
     assert not [line for line in lines if "assumed" in line]
     return run, bundle
@@ -108,13 +119,16 @@ def test_an_rgb_graph_gives_the_same_numbers_from_notebook_service_and_file(epyp
         answer = client.call({"image": image}).tokens
     done = epypes("call", bundle.path, path, "--out", f"drawing={tmp_path}/drawing.png")
     assert done.returncode == 0, done.stderr
-    printed = float(re.search(r"^score = (\S+)", done.stdout, re.M)[1])
     assert answer["score"] == run["score"]
-    assert printed == pytest.approx(run["score"], rel=1e-5)
+    assert f"\nscore = {run['score']!r}\n" in done.stdout
     assert np.array_equal(answer["drawing"], run["drawing"])
     assert np.array_equal(np.asarray(Image.open(tmp_path / "drawing.png")), run["drawing"])
     assert f"image = {path}, read as rgb, as in function 'grayscale'" in done.stdout
     assert done.stderr == ""
+    columns, line = run["columns"].tolist(), {key: value.tolist() for key, value in run["line"].items()}
+    shown = ", ".join([*map(str, columns[:6]), "...", *map(str, columns[-6:])])
+    assert f"\ncolumns = [{shown}] (300 in all)\n" in done.stdout, "a vector is its numbers"
+    assert f"\nline = {line!r}\n" in done.stdout
 
 
 def test_many_files_are_read_in_the_order_that_the_graph_takes(lane, photo):
