@@ -22,6 +22,7 @@ from epypes.images import Contracts, Order
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
+    from epypes.graph.validation import Delay
 
 _MARK: Final = "Annotated[np.ndarray, ep.Image(order={!r})]."
 
@@ -82,6 +83,7 @@ def find_orders(
     digraph: BipartiteDigraph,
     func_io: Mapping[str, Any],
     contracts: Mapping[str, Contracts],
+    delays: Mapping[str, Delay],
 ) -> tuple[dict[str, ColourOrder], list[Finding]]:
     """Find the orders of colours of tokens, and the tokens that two functions surely want in different ones.
 
@@ -93,8 +95,10 @@ def find_orders(
         What ``read_io`` returns.
     contracts
         The marks of images in annotations, by function.
+    delays
+        By token, the token whose previous value it has.
     """
-    search = _Search(functions, digraph, func_io, contracts)
+    search = _Search(functions, digraph, func_io, contracts, delays)
     search.run()
     return search.orders, search.findings
 
@@ -108,8 +112,10 @@ class _Search:
         digraph: BipartiteDigraph,
         func_io: Mapping[str, Any],
         contracts: Mapping[str, Contracts],
+        delays: Mapping[str, Delay],
     ) -> None:
         self._functions, self._digraph, self._func_io, self._contracts = functions, digraph, func_io, contracts
+        self._delayed = [(previous, delay.token) for previous, delay in delays.items()]
         self._uses: dict[int, ColourUse] = {}
         self._disagreeing: set[tuple[str, str]] = set()
         self.orders: dict[str, ColourOrder] = {}
@@ -204,7 +210,10 @@ class _Search:
                         del self.orders[each]
 
     def _same_image(self, token: str) -> Iterator[tuple[str, bool]]:
-        """Give the tokens that a function makes of a token, or makes it of, with the same image."""
+        """Give the tokens that have the same image: a function passes it on, or its delay brings it again."""
+        for pair in self._delayed:
+            if token in pair:
+                yield pair[pair[0] == token], False
         maker = self._digraph.producer.get(token)
         around = [] if maker is None or maker not in self._digraph.inputs else [maker]
         for name in (*around, *self._digraph.consumers.get(token, ())):

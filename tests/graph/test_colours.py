@@ -275,6 +275,18 @@ def test_an_image_that_is_passed_on_has_the_order_on_both_sides():
     assert found == dict.fromkeys(("photo", "image", "smooth", "part", "drawing"), "rgb")
 
 
+def test_a_delayed_image_has_the_order_of_the_image():
+    def mixed(image, previous):
+        return cv2.addWeighted(image, 0.5, previous, 0.5, 0)
+
+    cg = ep.delay(
+        graph(mix=(mixed, (("image", "before"), "mixture")), gray=(gray, ("image", "grey"))), "mixture", "before"
+    )
+    assert {token: found.order for token, found in cg.colours.items()} == dict.fromkeys(
+        ("image", "mixture", "before"), "rgb"
+    )
+
+
 def test_behind_a_conversion_the_order_is_the_other():
     assert orders(convert=(to_rgb, ("image", "rgb")), gray=(gray, ("rgb", "grey"))) == {"image": "bgr", "rgb": "rgb"}
     found = orders(turn=(reversed_channels, ("image", "turned")), gray=(saturation, ("turned", "s")))

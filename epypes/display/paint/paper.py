@@ -93,7 +93,8 @@ class _Painter:
         draw = self._draw.get(tag)
         if draw is not None:
             written = dict(part.split(":", 1) for part in element.get("style", "").split(";") if part)
-            draw(element, {**paper_declarations((*around, own)), **written})
+            dashes = {name: element.attrib[name] for name in element.attrib.keys() & {"stroke-dasharray"}}
+            draw(element, {**dashes, **paper_declarations((*around, own)), **written})
         for inner in element:
             self.paint(inner, (*around, own) if tag != "svg" else around)
 
