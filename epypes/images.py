@@ -203,6 +203,12 @@ def _fits(dtype: Any, ends: tuple[float, float]) -> bool:
     return dtype.kind in "uib" and ends[0] <= least and largest <= ends[1]
 
 
+def has_colours(value: Any) -> bool:
+    """Whether a value is an array (y, x, 3) or (y, x, 4), whose channels have an order."""
+    shape = getattr(value, "shape", None)
+    return isinstance(shape, tuple) and len(shape) == 3 and shape[2] in (3, 4)
+
+
 def swapped(image: Any) -> Any:
     """Return a copy of an array (y, x, 3) or (y, x, 4) with red and blue exchanged: BGR as RGB, and back."""
     copy = image.copy()

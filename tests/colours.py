@@ -19,12 +19,12 @@ def red_part(image: Colours) -> Annotated[np.ndarray, RGB]:
     return part
 
 def as_it_is(image):
-    return image
+    return np.maximum(image, 0)
 """
 
 
 def red_runner() -> ep.CompGraphRunner:
-    """Return a runner of a notebook's graph: of an RGB image, it keeps what is red; nobody says it of ``unsaid``."""
+    """Return a runner of a notebook's graph: of an RGB image, it keeps what is red; nothing says it of ``unsaid``."""
     name = "<cell of colours>"
     linecache.cache[name] = (len(_CELL), None, _CELL.splitlines(keepends=True), name)
     names = {"__name__": "__main__", "np": np, "ep": ep, "Annotated": Annotated}

@@ -22,6 +22,15 @@ RESULT: Final = "epypes.result"
 # The name of a recorded answer, among the outputs of a sample.
 ANSWER: Final = "the answer of f_out"
 
+# The dict of adapters whose name is that of another function in the bundle's module.
+ADAPTERS: Final = "adapters"
+
+
+def own_part(module: object, name: str) -> Any:
+    """Return what a bundle's module has of its own under a name; AttributeError if it has nothing."""
+    others = getattr(module, ADAPTERS, {})
+    return others[name] if type(others) is dict and name in others else getattr(module, name)
+
 
 def payload_of(inputs: Sequence[str], rgb: Collection[str] = ()) -> Callable[[Any], Mapping[str, Any]]:
     """Return an f_in: it takes the parts of an Envelope that are named like the input tokens.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.adapters import answer_with, payload_of
+from epypes.bundle.adapters import answer_with, own_part, payload_of
 from epypes.bundle.arrays import StoredArray, read_array
 from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, bundle_files, check_manifest
 from epypes.bundle.mutable_state import MutableState
@@ -112,7 +112,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
         names = ", ".join(map(repr, missing))
         text = f"{folder / MODULE} defines no {names}, which the bundle needs. Promote the graph again."
         raise BundleError(folder, text)
-    own = {name: getattr(module, name) for name in settings.own}
+    own = {name: own_part(module, name) for name in settings.own}
     adapters = {name: adapter for name, adapter in own.items() if name != MAKER}
     state = MutableState({**module.func_dict, **adapters}, values)
     cg = _graph(module, state.guarded(module.func_dict), settings)

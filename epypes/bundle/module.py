@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
+from epypes.bundle.adapters import ADAPTERS, own_part
 from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import arguments_of, parameters_of
 from epypes.bundle.equivalence import Pair, refusal
@@ -73,13 +74,20 @@ def write_module(
 
     def write(gathered: Slice) -> dict[str, str]:
         graphs, definitions = Graphs(gathered), gathered.definitions
-        references = graphs.write(cg)
+        references, others = graphs.write(cg), dict[str, str]()
         for name, adapter in adapters.items():
             reference = graphs.value(adapter, f"Function {name!r}", name)
-            if reference != name:
+            if reference != name and gathered.is_taken(name):
+                others[name] = reference
+            elif reference != name:
                 with gathered.noted_refusals():
                     gathered.reserve(name)
                 definitions[name] = f"{_ADAPTER_COMMENTS[name]}\n{name} = {reference}"
+        if others:
+            with gathered.noted_refusals():
+                gathered.reserve(ADAPTERS)
+            comment = "# The names of these mean other functions or values in this module."
+            definitions[ADAPTERS] = f"{comment}\n{_dict(ADAPTERS, others)}"
         if pipeline is not None:
             with gathered.noted_refusals():
                 definitions[MAKER] = graphs.maker(pipeline)
@@ -104,7 +112,7 @@ def _pairs(
     for name, function in cg.functions.items():
         yield f"Function {name!r}", function, module.func_dict[name]
     for name, adapter in adapters.items():
-        yield f"Function {name!r}", adapter, getattr(module, name)
+        yield f"Function {name!r}", adapter, own_part(module, name)
     for name, kind in enums.items():
         yield f"Class {name!r}", kind, module.enums[name]
     if pipeline is not None:

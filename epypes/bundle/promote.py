@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import fcntl
+import logging
 import os
 import shutil
 import sys
@@ -32,12 +33,14 @@ from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import MOST_NUMBERS, Settings, unwritable, writable_defaults, write_settings
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
-from epypes.graph import colour_order
+from epypes.graph import ASSUMED, ColourOrder, CompGraph
+from epypes.images import has_colours
 from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import as_written
 
+_LOG: Final = logging.getLogger("epypes.bundle")
 # From Linux's fcntl.h and fs.h.
 _AT_FDCWD: Final = -100
 _RENAME_EXCHANGE: Final = 2
@@ -77,7 +80,8 @@ def promote(
         Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
         or mappings by token.
     on_progress
-        Called with what is being done, and with what the replays found that is worth knowing.
+        Called with what is being done, and with what was assumed or found that is worth knowing. Without, an order of
+        colours that is assumed is logged as a warning.
 
     Raises
     ------
@@ -92,7 +96,9 @@ def promote(
         _check_place(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_folder(target) as draft:
-            _write(draft, target, runner_or_pipeline, adapters, outputs, samples)
+            assumptions = _write(draft, target, runner_or_pipeline, adapters, outputs, samples).assumptions()
+            if assumptions:
+                (_LOG.warning if on_progress is _ignore else on_progress)(assumptions)
             on_progress("replaying in fresh processes")
             for note in prove(draft, target).notes:
                 on_progress(note)
@@ -144,7 +150,7 @@ def _write(
     adapters: Mapping[str, Callable[..., Any]],
     outputs: Sequence[str] | None,
     samples: Iterable[Any],
-) -> None:
+) -> Settings:
     """Write all that can be written without running anything new; raise every reason against it at once."""
     if isinstance(given, Pipeline):
         runner, cg, attributes = given.runner, given.source_cg, dict(given.attributes)
@@ -155,10 +161,10 @@ def _write(
         cg.require_token(token)
     hyperparameters, stored = store_hyperparameters(runner.hyperparameters, MOST_NUMBERS)
     free = runner.free_source_tokens
-    rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
+    colours = _colours(cg, dict.fromkeys((*free, *wanted)), runner.last)
     pipeline = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None
     settings = Settings(
-        target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
+        target.name, free, wanted, hyperparameters, colours, writable_defaults(cg, hyperparameters), cg.types,
         own=(*adapters, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
     )  # fmt: skip
     reasons = [*_unready(runner, wanted), *unwritable(hyperparameters), *unwritable(attributes, "Attribute")]
@@ -173,6 +179,18 @@ def _write(
     stored.write(draft)
     for number, run in enumerate(runs):
         _record(draft / SAMPLES / f"{number:03}.npz", run, settings, adapters.get("f_out"))
+    return settings
+
+
+def _colours(cg: CompGraph, tokens: Iterable[str], run: Run | None) -> dict[str, ColourOrder]:
+    """Return the order of colours of tokens; it is assumed of an image of which no function says it."""
+    found = {}
+    for token in tokens:
+        if token in cg.colours:
+            found[token] = cg.colours[token]
+        elif run is not None and token in run and has_colours(run[token]):
+            found[token] = ASSUMED
+    return found
 
 
 def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:

@@ -21,9 +21,9 @@ from epypes.bundle.arrays import StoredArray
 from epypes.bundle.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
-from epypes.graph import CompGraph
+from epypes.graph import ASSUMED, ColourOrder, CompGraph
 from epypes.hints import Param
-from epypes.images import Order
+from epypes.images import ORDERS, Order
 from epypes.nothing import Nothing
 from epypes.optional import optional_import
 from epypes.run.guard import is_plain_array
@@ -46,11 +46,12 @@ _TOO_LARGE: Final = (
     "a hyperparameter of its own, or let the function read it from a variable of the notebook, outside of it: the "
     "bundle has either as a file. Or make it in a function"
 )
+_ASSUMED: Final = "No function says the order of the colours of {}: bgr is assumed."
+_MARK_RGB: Final = 'If it is rgb, annotate a parameter: Annotated[np.ndarray, ep.Image(order="rgb")].'
 # What stands before the lines that need a word.
 _COMMENTS: Final = {
     "types": "The annotations of the functions are not compared.",
     "inputs": "The tokens that an event brings, and those that its answer carries.",
-    "rgb": "Their three or four channels are RGB; those of all others are BGR.",
     "own": "What pipeline.py has of its own, in place of what a bundle usually does.",
 }
 
@@ -77,8 +78,8 @@ class Settings:
         The tokens that an answer carries.
     hyperparameters
         Values by token.
-    rgb
-        Of the inputs and outputs, those whose three or four channels are RGB.
+    colours
+        The order of colours of inputs and outputs that have one, by token.
     defaults
         The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
     types
@@ -99,7 +100,7 @@ class Settings:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     hyperparameters: Mapping[str, Any]
-    rgb: tuple[str, ...] = ()
+    colours: Mapping[str, ColourOrder] = field(default_factory=dict)
     defaults: Mapping[str, Any] = field(default_factory=dict)
     types: bool = True
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
@@ -108,9 +109,23 @@ class Settings:
     has_groups: bool = False
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
+    @property
+    def rgb(self) -> tuple[str, ...]:
+        """Of the inputs and outputs, those whose three or four channels are RGB."""
+        return tuple(token for token, found in self.colours.items() if found.order == "rgb")
+
+    def colour(self, token: str) -> ColourOrder:
+        """Return the order of a token's colours, and what says it."""
+        return self.colours.get(token, ASSUMED)
+
     def order(self, token: str) -> Order:
         """Return the order of a token's colours."""
-        return "rgb" if token in self.rgb else "bgr"
+        return self.colour(token).order
+
+    def assumptions(self) -> str:
+        """Return one line on the colours whose order is assumed; empty if there are none."""
+        tokens = ", ".join(repr(token) for token, found in self.colours.items() if found.is_assumed)
+        return tokens and f"{_ASSUMED.format(tokens)} {_MARK_RGB}"
 
 
 def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[str]:
@@ -141,11 +156,16 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     bundle |= {} if settings.types else {"types": False}
     bundle |= {"groups": True} if settings.has_groups else {}
     ports = {"inputs": list(settings.inputs), "outputs": list(settings.outputs)}
-    ports |= {key: list(getattr(settings, key)) for key in ("rgb", "own") if getattr(settings, key)}
+    ports |= {"own": list(settings.own)} if settings.own else {}
     document = tomlkit.document()
     document.add(tomlkit.comment(_COMMENT))
     document.add("bundle", _table(bundle))
     document.add("ports", _table(ports))
+    colours = tomlkit.table(is_super_table=True)
+    for token, found in settings.colours.items():
+        colours.add(token, _colour_table(found))
+    if colours:
+        document.add("colours", colours)
     for section in ("hyperparameters", "defaults", "attributes"):
         tables = tomlkit.table(is_super_table=True)
         for name, value in getattr(settings, section).items():
@@ -179,6 +199,18 @@ def _table(entries: Mapping[str, Any], comment: str = "") -> Any:
             has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
             item.multiline(has_rows or len(item.as_string()) > _LINE)
         table.add(key, item)
+    return table
+
+
+def _colour_table(found: ColourOrder) -> Any:
+    """Return the table of a token's colours; where no function is named, the order is assumed."""
+    with optional_import():
+        import tomlkit
+    if not found.is_assumed:
+        return _table({"order": found.order, "function": found.function})
+    table, order = _table({}, _MARK_RGB), tomlkit.string(found.order)
+    order.comment("assumed").trivia.comment_ws = "  "
+    table.add("order", order)
     return table
 
 
@@ -233,13 +265,15 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         if bundle["format"] != FORMAT:
             text = f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}. Promote the graph again"
             raise BundleError(path, f"{text}, or use the EPypes that wrote it.")
+        if "rgb" in ports:
+            raise ValueError("its orders of colours stand under [ports], where an older EPypes wrote them")
         entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),
             _strings(ports["inputs"]),
             _strings(ports["outputs"]),
             _values(entries, enums),
-            _strings(ports.get("rgb", [])),
+            _read_colours(document.get("colours", {})),
             _values(document.get("defaults", {}), enums),
             bundle.get("types", True) is not False,
             read_tolerances(document),
@@ -252,6 +286,13 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise BundleError(path, f"{path} can't be read: {error}. Promote the graph again.") from error
+
+
+def _read_colours(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, ColourOrder]:
+    for token, entry in entries.items():
+        if entry["order"] not in ORDERS:
+            raise ValueError(f"the order of the colours of {token!r} is {entry['order']!r}, not bgr or rgb")
+    return {token: ColourOrder(entry["order"], entry.get("function", "")) for token, entry in entries.items()}
 
 
 def _strings(values: Sequence[Any]) -> tuple[str, ...]:

@@ -8,23 +8,20 @@ from __future__ import annotations
 
 import ast
 import inspect
-import linecache
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from types import FunctionType, ModuleType
 from typing import Any, Final
 
 from epypes.catalog.lookup import CatalogEntry, entry_of
 from epypes.graph import unwrapped
 from epypes.graph.signature import documented_signature
+from epypes.graph.source import Definition, argument_names, definition_of
 
 _CONVERSIONS: Final = ("int", "float", "round", "bool")
 # A user's function may call another, and that another.
 _DEEPEST: Final = 3
-
-_Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +76,10 @@ def uses(function: Any, parameter: str) -> tuple[Use, ...]:
 
 
 def _uses(function: Any, parameter: str, depth: int) -> Iterator[Use]:
-    node = _definition(function)
+    node = definition_of(function)
     if node is None or not depth or _is_changed(node, parameter):
         return
-    names, own = _names_of(function, node), set(_argument_names(node))
+    names, own = _names_of(function, node), set(argument_names(node))
     for part in ast.walk(node):
         if isinstance(part, ast.Call):
             yield from _uses_in_call(part, names, own, parameter, depth, function)
@@ -132,7 +129,7 @@ def _is_parameter(expression: ast.expr, parameter: str) -> bool:
     return False
 
 
-def _is_changed(node: _Definition, parameter: str) -> bool:
+def _is_changed(node: Definition, parameter: str) -> bool:
     """Whether a function assigns another value to the parameter's name; ``k = int(k)`` is the same value."""
     parts = [*ast.walk(node)]
     conversions = [
@@ -142,39 +139,7 @@ def _is_changed(node: _Definition, parameter: str) -> bool:
     return any(store.id == parameter and store not in conversions for store in stores)
 
 
-def _definition(function: Any) -> _Definition | None:
-    """Return the definition of a function in its source as it is now; None if it is not there."""
-    if not isinstance(function, FunctionType):
-        return None
-    code = function.__code__
-    names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
-    text = "".join(linecache.getlines(code.co_filename, function.__globals__))
-    for node in _definitions(text).get(code.co_firstlineno, ()):
-        if getattr(node, "name", "<lambda>") == code.co_name and _argument_names(node) == names:
-            return node
-    return None
-
-
-@lru_cache(maxsize=16)  # one cell often defines many functions
-def _definitions(text: str) -> Mapping[int, tuple[_Definition, ...]]:
-    """Return the definitions in a text by their first line, decorators included."""
-    try:
-        tree = ast.parse(text)
-    except (SyntaxError, ValueError, RecursionError):
-        return {}
-    found: dict[int, tuple[_Definition, ...]] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, _Definition):
-            line = min([node.lineno, *(decorator.lineno for decorator in getattr(node, "decorator_list", ()))])
-            found[line] = (*found.get(line, ()), node)
-    return found
-
-
-def _argument_names(node: _Definition) -> tuple[str, ...]:
-    return tuple(argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs))
-
-
-def _names_of(function: FunctionType, node: _Definition) -> dict[str, Any]:
+def _names_of(function: FunctionType, node: Definition) -> dict[str, Any]:
     """Return the objects of the names in a function: Python's own, its module's, enclosing ones, imported in it."""
     known = inspect.getclosurevars(function)
     names = {**known.builtins, **known.globals, **known.nonlocals}

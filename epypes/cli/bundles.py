@@ -37,7 +37,9 @@ def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: 
 
 def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], samples: Sequence[str] = ()) -> None:
     """Promote with a progress bar."""
+    from epypes.bundle.manifest import SETTINGS
     from epypes.bundle.promote import promote_notebook
+    from epypes.bundle.settings import read_settings
 
     with click.progressbar(length=1, label="executing the notebook", file=sys.stderr) as bar:
 
@@ -51,6 +53,9 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], s
 
         promote_notebook(notebook, name, to, list(outputs) or None, on_cell, on_step, list(samples))
         on_step("promoted")
+    assumptions = read_settings(to / SETTINGS).assumptions()
+    if assumptions:
+        click.echo(f"Note: {assumptions}", err=True)
 
 
 @click.command()

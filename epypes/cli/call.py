@@ -20,10 +20,14 @@ from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError, UnknownName
 
 if TYPE_CHECKING:
+    from epypes.bundle.settings import Settings
     from epypes.images import Order
     from epypes.service import Answer
 
 _CALLS: Final = 5
+# What is read in a line: a homography, a line per lane, the bins of a small histogram.
+_MOST_NUMBERS: Final = 24
+_MOST_AXES: Final = 3
 _EPYPES: Final = (sys.executable, "-m", "epypes.cli")
 
 _address_option: Final = functools.partial(
@@ -56,30 +60,71 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     """
     from epypes.bundle.manifest import SETTINGS, check_manifest
     from epypes.bundle.settings import read_settings
-    from epypes.display.previews.preview import preview
+    from epypes.images import has_colours
     from epypes.nothing import Nothing
     from epypes.service import Client
 
     check_manifest(bundle)
     settings = read_settings(bundle / SETTINGS)
     inputs = _by_token(images, settings.inputs, "input")
-    files = _by_token(out, settings.outputs, "output")
+    wanted = _by_token(out, settings.outputs, "output")
     payload = {token: _read(text, settings.order(token)) for token, text in inputs.items()}
+    coloured = [token for token, text in inputs.items() if has_colours(payload[token]) and Path(text).exists()]
     with Client(bundle, **options) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
-    written = {token: file for token, file in files.items() if answer.tokens[token] is not Nothing}
-    for token, file in written.items():
+    files = {token: file for token, file in wanted.items() if answer.tokens[token] is not Nothing}
+    pictures = (token for token, file in files.items() if Path(file).suffix != ".npy")
+    written = [token for token in pictures if has_colours(answer.tokens[token])]
+    for token, file in files.items():
         _write(file, answer.tokens[token], settings.order(token))
+    _warn_of_assumed(settings, [*coloured, *written])
     if as_json:
         click.echo(json.dumps(asdict(replace(answer, tokens={}))))
         return
+    for token in coloured:
+        click.echo(f"{token} = {inputs[token]}, read as {settings.colour(token)}")
     for token, value in answer.tokens.items():
         if value is Nothing:
-            click.echo(f"{token} = Nothing{f': {files[token]} is not written' if token in files else ''}")
-        elif token not in written:
-            click.echo(f"{token} = {preview(value).text}")
-    _print_answer(" ".join([f"{bundle}:", *written.values()]), answer)
+            unwritten = f": {wanted[token]} is not written" if token in wanted else ""
+            click.echo(f"{token} = Nothing{unwritten}")
+        elif token not in files:
+            click.echo(f"{token} = {_text_of(value)}")
+    _print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
+
+
+def _text_of(value: Any, level: int = 3) -> str:
+    """Return an answer as text: vectors and small matrices as their numbers, also in lists and dicts."""
+    import numpy as np
+
+    from epypes.display.previews.preview import preview
+
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
+        is_short = value.ndim == 1 or (0 < value.size <= _MOST_NUMBERS and 0 < value.ndim <= _MOST_AXES)
+        return _items_text(value, _MOST_AXES) if is_short else preview(value).text
+    if type(value) in (list, tuple) and level:
+        return _items_text(value, level - 1)
+    if type(value) is dict and 0 < len(value) <= _MOST_NUMBERS and level:
+        return f"{{{', '.join(f'{preview(key).text}: {_text_of(item, level - 1)}' for key, item in value.items())}}}"
+    return str(value) if isinstance(value, np.generic | float) else preview(value).text
+
+
+def _items_text(values: Any, level: int) -> str:
+    """Return items in brackets, of many the first and the last ones."""
+    count, half = len(values), _MOST_NUMBERS // 4
+    if count <= _MOST_NUMBERS:
+        return f"[{', '.join(_text_of(item, level) for item in values)}]"
+    first, last = (", ".join(_text_of(item, level) for item in part) for part in (values[:half], values[-half:]))
+    return f"[{first}, ..., {last}] ({count} in all)"
+
+
+def _warn_of_assumed(settings: Settings, tokens: Sequence[str]) -> None:
+    """Print one line if the order of the colours in a file is assumed."""
+    assumed = [token for token in tokens if settings.colour(token).is_assumed]
+    if assumed:
+        names = ", ".join(map(repr, assumed))
+        text = f"Warning: no function says the order of the colours of {names}; the file is read or written as bgr."
+        click.echo(f'{text} If it is rgb, mark it in the notebook with ep.Image(order="rgb"), and promote.', err=True)
 
 
 def _print_answer(title: str, answer: Answer) -> None:

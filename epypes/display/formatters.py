@@ -10,6 +10,7 @@ from typing import Any
 
 from epypes.display.layout.geometry import Direction
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
+from epypes.display.paint.paper import save_on_paper
 from epypes.display.paint.svg import alt_text, paint_svg
 from epypes.display.paint.tables import Tabular, paint_table, paint_text, repr_text, summary_of, table_of, text_table
 from epypes.display.paint.times import paint_bars, report_times, summary_times, times_alt_text
@@ -113,14 +114,21 @@ class Figure:
         return _graph_forms(self.view, self.table)["text/html"]
 
     def save(self, path: str | Path) -> Path:
-        """Write the picture as ``.svg``, as a page of its own as ``.html``, or what is to be seen as ``.json``.
+        """Write the picture as ``.svg``, ``.pdf`` or ``.png``, as a page as ``.html``, or what is seen as ``.json``.
+
+        A PNG has two pixels for each of the SVG, on white. A PDF has text and lines as such.
 
         Raises
         ------
         ValueError
             The path has another ending.
+        MissingPackage
+            A PNG or a PDF needs Matplotlib.
         """
         path = Path(path)
+        if path.suffix in (".png", ".pdf"):
+            save_on_paper(self.svg, path)
+            return path
         if path.suffix == ".svg":
             text = self.svg
         elif path.suffix == ".html":
@@ -130,8 +138,7 @@ class Figure:
         elif path.suffix == ".json":
             text = json.dumps(to_json(self.view))
         else:
-            way_out = "A browser opens .svg and .html, and prints them as PDF or saves them as pictures."
-            raise ValueError(f"save() writes .svg, .html and .json, not {path.name!r}. {way_out}")
+            raise ValueError(f"save() writes .svg, .html, .png, .pdf and .json, not {path.name!r}. Use one of these.")
         path.write_text(text, encoding="utf-8")
         return path
 

@@ -15,15 +15,18 @@ from epypes.graph.algebra import (
     with_defaults,
     with_functions,
 )
+from epypes.graph.colours import ASSUMED, ColourOrder, colour_order
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.identity import inner_graph, is_redefined_inside, redefined, unwrapped
 from epypes.graph.placeholder import Placeholder, is_placeholder
 from epypes.graph.signature import outputs
 from epypes.graph.switch import Switch, as_switch, switch
-from epypes.graph.token_annotations import annotated_params, colour_order, image_hint
+from epypes.graph.token_annotations import annotated_params, image_hint
 from epypes.graph.validation import Delay
 
 __all__ = [
+    "ASSUMED",
+    "ColourOrder",
     "CompGraph",
     "Delay",
     "Placeholder",

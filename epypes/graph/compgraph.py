@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
+from epypes.graph.colours import ColourOrder, find_orders
 from epypes.graph.identity import is_redefined_inside, redefined
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.signature import declared_outputs, positional_of, signature_of
@@ -117,13 +118,15 @@ class CompGraph(OldNames):
         order = digraph.run_order()
         contracts = read_contracts(parts.functions, digraph)
         findings += find_problems(parts, digraph, func_io, contracts, len(order) == len(digraph.inputs))
+        colours, contradictions = find_orders(parts.functions, digraph, func_io, contracts, parts.delays)
+        findings += contradictions
         if findings:
             raise GraphError(findings)
         if order != tuple(digraph.inputs):
             inputs, outputs = digraph.inputs, digraph.outputs
             digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
         self._digraph, self._types = digraph, parts.types
-        self._contracts = MappingProxyType(contracts)
+        self._contracts, self._colours = MappingProxyType(contracts), MappingProxyType(colours)
         self._functions = MappingProxyType({name: parts.functions[name] for name in order})
         self._func_io = MappingProxyType({name: func_io[name] for name in order})
         self._known = digraph.tokens()
@@ -224,6 +227,11 @@ class CompGraph(OldNames):
     def contracts(self) -> Mapping[str, Contracts]:
         """The marks of images in annotations, by function: a mark or None for each input, and for each output."""
         return self._contracts
+
+    @property
+    def colours(self) -> Mapping[str, ColourOrder]:
+        """The order of colours by token, where a function says it: by a mark, or surely in its source."""
+        return self._colours
 
     def func_inputs(self, name: str) -> tuple[str, ...]:
         """Return the input tokens of a function."""

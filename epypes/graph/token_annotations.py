@@ -9,7 +9,7 @@ from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.signature import distinct
 from epypes.hints import Param, Roi, annotated_param
-from epypes.images import Contracts, Image, Order, contracts_of, is_marked
+from epypes.images import Contracts, Image, contracts_of, is_marked
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
@@ -31,18 +31,12 @@ def image_hint(cg: CompGraph, token: str) -> Image | None:
     """
     cg.require_token(token)
     made = None
-    for _, name, mark, verb in _marks(cg.contracts, cg.digraph):
+    for _, name, mark, verb in marks_of(cg.contracts, cg.digraph):
         if name == token and mark.order is not None:
             return mark
         if name == token and verb == "makes":
             made = mark
     return made
-
-
-def colour_order(cg: CompGraph, token: str) -> Order:
-    """Return what three and four channels of a token are: BGR, unless an annotation says otherwise."""
-    hint = image_hint(cg, token)
-    return (hint and hint.order) or "bgr"
 
 
 def read_contracts(functions: Mapping[str, Callable[..., Any]], digraph: BipartiteDigraph) -> dict[str, Contracts]:
@@ -55,21 +49,13 @@ def read_contracts(functions: Mapping[str, Callable[..., Any]], digraph: Biparti
     }
 
 
-def check_images(contracts: Mapping[str, Contracts], digraph: BipartiteDigraph, types: bool) -> Iterable[Finding]:
-    """Find tokens that two functions want in different orders of colours, or as images that no image is both.
-
-    The latter only with ``types``.
-    """
-    ordered: dict[str, tuple[str, str, Order]] = {}
+def check_images(contracts: Mapping[str, Contracts], digraph: BipartiteDigraph) -> Iterable[Finding]:
+    """Find tokens that two functions want as images that no image is both."""
     made: dict[str, tuple[str, Image]] = {}
-    for name, token, mark, verb in _marks(contracts, digraph):
-        if mark.order is not None:
-            first = ordered.setdefault(token, (name, verb, mark.order))
-            if first[2] != mark.order:
-                yield _two_orders(token, first, (name, verb, mark.order))
+    for name, token, mark, verb in marks_of(contracts, digraph):
         if verb == "makes":
             made[token] = name, mark
-        elif types and token in made and not made[token][1].fits(mark):
+        elif token in made and not made[token][1].fits(mark):
             maker, as_made = made[token]
             text = (
                 f"Function {maker!r} makes token {token!r} as {as_made}, but {name!r} takes it as {mark}, and no image "
@@ -78,21 +64,10 @@ def check_images(contracts: Mapping[str, Contracts], digraph: BipartiteDigraph, 
             yield Finding("types", text, (token, maker, name))
 
 
-def _marks(contracts: Mapping[str, Contracts], digraph: BipartiteDigraph) -> Iterator[tuple[str, str, Image, str]]:
+def marks_of(contracts: Mapping[str, Contracts], digraph: BipartiteDigraph) -> Iterator[tuple[str, str, Image, str]]:
     """Give every mark: function, token, mark and ``"makes"`` or ``"takes"``, makers first."""
     for side, verb, tokens_of in ((1, "makes", digraph.outputs), (0, "takes", digraph.inputs)):
         for name, marks in contracts.items():
             for token, mark in zip(tokens_of[name], marks[side], strict=False):
                 if mark is not None:
                     yield name, token, mark, verb
-
-
-def _two_orders(token: str, first: tuple[str, str, Order], second: tuple[str, str, Order]) -> Finding:
-    (name, verb, order), (other, other_verb, other_order) = first, second
-    place = "between them" if verb == "makes" else f"before {other!r}"
-    text = (
-        f"Function {name!r} {verb} token {token!r} as {order}, but {other!r} {other_verb} it as {other_order}. "
-        f"Convert it in a function {place}: "
-        f"cv2.cvtColor({token}, cv2.COLOR_{order.upper()}2{other_order.upper()})."
-    )
-    return Finding("colour", text, (token, name, other))

@@ -151,9 +151,9 @@ def find_problems(
         )
         yield Finding("cycle", text, cycle)
     yield from _check_arity(functions, digraph)
-    yield from check_images(contracts, digraph, parts.types)
     yield from _check_special_functions(functions, digraph)
     if parts.types:
+        yield from check_images(contracts, digraph)
         yield from check_types(functions, digraph, func_io)
     # A token that is made needs no default.
     yield from _check_defaults(default for default in parts.defaults if default.token not in digraph.producer)

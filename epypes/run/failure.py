@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final
 
 from epypes.run.guard import explain_write, is_array, lend_to_reader
+from epypes.run.snapshot import is_numpy_scalar
 from epypes.run.staleness import TokenManager
 
 # A note is one line that names the culprit, so a value in it is short.
 _BRIEF: Final = 40
+_NUMBERS: Final = frozenset((bool, int, float, complex, type(None)))
+_CONTAINERS: Final = frozenset((list, tuple, dict, set, frozenset, deque, bytes, bytearray))
+# Of so many items the types are looked at.
+_MOST_ITEMS: Final = 1_000
 # OpenCV begins its messages with its version and the place in its own source; what went wrong comes after.
 _OPENCV_PLACE: Final = re.compile(r"^OpenCV\([^)]*\) \S+ error: ")
 
@@ -103,13 +110,27 @@ def failure_of(tokens: TokenManager, place: int, exception: BaseException) -> Fa
 
 
 def _brief(value: Any) -> str:
-    """Return the text of an input in a note: a small value itself, of an array its dtype and shape."""
+    """Return the text of an input in a note: a small value itself, of an array its dtype and shape, else its type."""
+    kind = type(value)
     with contextlib.suppress(Exception):  # of an integer with too many digits, or an array's own class
-        if type(value) in (bool, int, float, type(None)) or (type(value) is str and len(value) <= _BRIEF):
-            return f"={value!r:.{_BRIEF}}"
         if is_array(value):
-            return f": {value.dtype} {' x '.join(map(str, value.shape))}"
+            return f": {value.dtype} {' x '.join(map(str, value.shape)) or 'without axes'}"
+        if kind in _NUMBERS or is_numpy_scalar(kind) or (kind is str and len(value) <= _BRIEF):
+            return f"={value!r:.{_BRIEF}}"
+        return f": {_kind_text(value, kind)}"
     return ""
+
+
+def _kind_text(value: Any, kind: type) -> str:
+    """Return the type of a value that is no array, and of a container how many items of which type it has."""
+    name: str = type.__dict__["__name__"].__get__(kind)
+    if kind is str:
+        return f"str of {len(value)} characters"
+    if kind not in _CONTAINERS:
+        return name
+    kinds = {type.__dict__["__name__"].__get__(type(item)) for item in islice(value, _MOST_ITEMS)}
+    of_one_kind = kind is not dict and kind is not bytes and len(kinds) == 1 and len(value) <= _MOST_ITEMS
+    return f"{name} of {len(value)}{f' {kinds.pop()}' if of_one_kind else ''}"
 
 
 def _lent(value: Any) -> Any:

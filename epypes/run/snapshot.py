@@ -214,7 +214,7 @@ def is_same(now: Any, saved: Any) -> bool:
         return now.__self__ is saved.__self__ and now.__func__ is saved.__func__
     if kind in ATOMS:
         return bool(now == saved)
-    return _is_scalar(kind) and bool(now.dtype == saved.dtype and now.tobytes() == saved.tobytes())
+    return is_numpy_scalar(kind) and bool(now.dtype == saved.dtype and now.tobytes() == saved.tobytes())
 
 
 def _order(value: Any) -> tuple[str, int]:
@@ -222,7 +222,8 @@ def _order(value: Any) -> tuple[str, int]:
     return type(value).__name__, 0 if type(value) in ATOMS else id(value)
 
 
-def _is_scalar(kind: type) -> bool:
+def is_numpy_scalar(kind: type) -> bool:
+    """Whether values of a type are NumPy's numbers or texts, which never change."""
     numpy = sys.modules.get("numpy")
     return numpy is not None and issubclass(kind, numpy.generic) and not issubclass(kind, numpy.object_ | numpy.void)
 

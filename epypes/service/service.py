@@ -245,6 +245,7 @@ class Service:
             "inputs": list(bundle.settings.inputs),
             "outputs": list(bundle.settings.outputs),
             "rgb": list(bundle.settings.rgb),
+            "colours": {token: str(found) for token, found in bundle.settings.colours.items()},
             "func_io": {} if connection is None else dict(connection.about.get("func_io", {})),
             "pid": os.getpid(),
             "worker_pid": None if connection is None else connection.pid,

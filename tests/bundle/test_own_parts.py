@@ -432,6 +432,25 @@ def test_an_f_out_whose_answer_depends_on_the_time_is_not_compared(tmp_path):
     assert verify(bundle.path).identical
 
 
+@pytest.mark.parametrize("adapter", ["functools.partial(f_out, most=2)", "lambda view: f_out(view, 2)"])
+def test_an_f_out_that_calls_a_function_of_this_name_is_promoted_as_any_other(tmp_path, adapter):
+    names = cell(
+        "import functools\n\nimport numpy as np\n\nimport epypes as ep\nfrom epypes.wire import Envelope\n\n\n"
+        "def double(x):\n    return 2 * x\n\n\n"
+        "def f_in(event):\n    return {'x': event.parts['x']}\n\n\n"
+        "def f_out(view, most):\n    return Envelope('first', {'first': view['y'][:most]})\n\n\n"
+        f"answer = {adapter}\n"
+    )
+    pipe = ep.FullPipeline("p", double_graph(names), queue.Queue(), queue.Queue(), names["f_in"], names["answer"])
+    pipe.run(x=np.arange(5))
+    bundle = ep.promote(pipe, tmp_path / "b")
+    assert verify(bundle.path).identical
+    served = pipeline_of(bundle, queue.Queue(), queue.Queue())
+    with served:
+        served.q_in.put(Envelope("request", {"x": np.arange(4)}))
+        assert served.q_out.get(timeout=60).parts["first"].tolist() == [0, 2]
+
+
 def test_two_read_bundles_of_one_name_do_not_know_each_other(names, tmp_path):
     runner = ep.CompGraphRunner(double_graph(names))
     runner.run(x=1)

@@ -580,9 +580,14 @@ def test_marks_are_promoted_and_the_bundle_says_which_ports_are_rgb(tmp_path):
     runner.run(image=red_image())
     bundle = ep.promote(runner, tmp_path / "red", outputs=["red", "unsaid"])
     assert verify(bundle.path).identical
-    source, ports = bundle.path / "pipeline.py", tomllib.loads((bundle.path / "pipeline.toml").read_text())["ports"]
+    source, settings = bundle.path / "pipeline.py", tomllib.loads((bundle.path / "pipeline.toml").read_text())
     assert 'RGB = ep.Image(dtype=("uint8",), shape=(None, None, 3), order="rgb")' in source.read_text()
-    assert ports == {"inputs": ["image"], "outputs": ["red", "unsaid"], "rgb": ["image", "red"]}
+    assert settings["ports"] == {"inputs": ["image"], "outputs": ["red", "unsaid"]}
+    assert settings["colours"] == {
+        "image": {"order": "rgb", "function": "red_part"},
+        "red": {"order": "rgb", "function": "red_part"},
+        "unsaid": {"order": "bgr"},
+    }
     assert bundle.settings.rgb == ("image", "red")
     assert [colour_order(ep.load(bundle.path).cg, token) for token in ("image", "red", "unsaid")] == [
         "rgb",
@@ -591,9 +596,24 @@ def test_marks_are_promoted_and_the_bundle_says_which_ports_are_rgb(tmp_path):
     ]
 
 
-def test_a_bundle_without_marks_says_nothing_of_colours(bundle):
-    assert "rgb" not in (bundle.path / "pipeline.toml").read_text()
+def test_an_order_that_no_function_says_is_assumed_in_one_line_and_written_so(runner, bundle, tmp_path, caplog):
+    text = (bundle.path / "pipeline.toml").read_text()
+    assert "[colours.image]" in text
+    assert '\norder = "bgr"  # assumed\n' in text
+    assert "[colours.edges]" not in text, "it has one channel"
     assert bundle.settings.rgb == ()
+    line = (
+        "No function says the order of the colours of 'image': bgr is assumed. If it is rgb, annotate a parameter: "
+        'Annotated[np.ndarray, ep.Image(order="rgb")].'
+    )
+    caplog.clear()
+    ep.promote(runner, tmp_path / "logged", outputs=["edges"])
+    assert caplog.messages == [line]
+    caplog.clear()
+    steps = []
+    ep.promote(runner, tmp_path / "shown", outputs=["edges"], on_progress=steps.append)
+    assert line in steps
+    assert caplog.messages == []
 
 
 @pytest.mark.parametrize("marked", [True, False])

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import json
+import queue
 import re
 import sys
 import xml.etree.ElementTree as ET
 
+import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
@@ -14,7 +17,8 @@ from epypes.display.layout.placement import lay_out
 from epypes.display.paint.svg import paint_svg
 from epypes.display.previews.preview import Chart, Preview
 from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, StageView, TokenView, from_json, to_json
-from epypes.errors import UnknownName
+from epypes.errors import MissingPackage, UnknownName
+from epypes.graph import Placeholder
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -154,9 +158,71 @@ def test_a_figure_is_saved_as_a_picture_a_page_or_json(grouped_runner, tmp_path)
     assert from_json(written) == figure.view
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.pdf", "a"])
+def test_a_figure_is_saved_as_png_with_its_thumbnails_and_states(tmp_path):
+    def colours(image):
+        return image, np.full((64, 64, 3), (10, 200, 20), np.uint8)
+
+    cg = ep.CompGraph(
+        {"colours": colours, "wide$name": len}, {"colours": ("image", ("same", "made")), "wide$name": ("same", "n")}
+    )
+    runner = ep.CompGraphRunner(cg)
+    runner.run(image=np.full((64, 64, 3), (10, 20, 200), np.uint8))
+    path = ep.show(runner).save(tmp_path / "a.png")
+    with Image.open(path) as picture:
+        svg = ET.fromstring(ep.show(runner).svg)
+        assert picture.size == (2 * int(svg.get("width")), 2 * int(svg.get("height")))
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+
+    def count(*colour):
+        return int((np.abs(pixels - colour).max(axis=-1) < 12).sum())
+
+    thumbnail = (2 * 96) ** 2  # pixels of a square thumbnail
+    assert count(200, 20, 10) == pytest.approx(2 * thumbnail, rel=0.05), "BGR as it is shown"
+    assert count(20, 200, 10) == pytest.approx(thumbnail, rel=0.05)
+    assert count(0x17, 0x69, 0xC2) > 500, "the borders of functions"
+    assert (pixels[0, 0] == 255).all(), "on white"
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_a_figure_is_saved_as_pdf_with_its_thumbnails_and_its_text(grouped_runner, tmp_path, direction):
+    figure = ep.show(grouped_runner, direction=direction)
+    written = figure.save(tmp_path / "a.pdf").read_bytes()
+    assert written.startswith(b"%PDF-")
+    masks = written.count(b"/SMask")
+    assert written.count(b"/Subtype /Image") - masks == figure.svg.count("<image ") > 0
+    assert b"/BaseFont" in written, "text is text"
+    assert written == figure.save(tmp_path / "b.pdf").read_bytes(), "the same picture is the same file"
+
+
+@pytest.mark.parametrize("ending", ["png", "pdf"])
+def test_pictures_of_all_kinds_of_vertices_can_be_saved_on_paper(photograph, tmp_path, ending):
+    def failing(image):
+        raise ValueError("no $x^2$ \u4e2d here")
+
+    either = ep.switch("either", {"a": "first", "b": "second"}, by="which", output="chosen")
+    cg = either | ep.CompGraph(
+        {"first": cv2.split, "later": Placeholder(), "histogram": lambda image: np.histogram(image, 64)[0], "fail": failing},
+        {"first": ("image", ("first", "second", "third")), "later": ("third", "more"), "histogram": ("image", "counts"),
+         "fail": ("counts", "nothing")},
+    )  # fmt: skip
+    pipeline = ep.FullPipeline("p", cg, queue.Queue(), queue.Queue(), lambda e: e, lambda v: v, {"which": "a"})
+    for target in ("chosen", "counts"):
+        pipeline.runner.run(target, image=photograph)
+    with pytest.raises(ValueError, match="here"):
+        pipeline.runner.run("nothing", image=photograph)
+    path = ep.show(pipeline).save(tmp_path / f"a.{ending}")
+    assert path.stat().st_size > 10_000
+
+
+def test_a_png_without_matplotlib_names_what_to_install(edge_graph, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(MissingPackage, match=r"'matplotlib' is missing. Run: pip install 'epypes\[vision\]'"):
+        ep.show(edge_graph).save(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a.tiff", "a"])
 def test_other_files_are_refused_with_those_that_can_be_written(edge_graph, tmp_path, name):
-    with pytest.raises(ValueError, match=r"writes \.svg, \.html and \.json, not '" + name):
+    with pytest.raises(ValueError, match=r"writes \.svg, \.html, \.png, \.pdf and \.json, not '" + name):
         ep.show(edge_graph).save(tmp_path / name)
     assert not list(tmp_path.iterdir())
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 import epypes as ep
@@ -151,6 +152,35 @@ def test_the_note_shows_small_values_and_the_shape_of_arrays(edge_runner, photog
         "In function 'blur': (image_gray: uint8 400 x 600, blur_kernel=4) -> (image_blurred)"
     ]
     assert edge_runner.last.failure.message.startswith("(-215:Assertion failed) ksize")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (np.zeros((2, 3)), "x: float64 2 x 3"),
+        (np.array(3), "x: int64 without axes"),
+        (np.float32(2.5), "x=np.float32(2.5)"),
+        ([1, 2, 3], "x: list of 3 int"),
+        ((np.zeros(3), np.zeros(3)), "x: tuple of 2 ndarray"),
+        ([1, "a"], "x: list of 2"),
+        ([cv2.KeyPoint(1, 2, 3)] * 4, "x: list of 4 KeyPoint"),
+        ({"a": 1}, "x: dict of 1"),
+        (frozenset(), "x: frozenset of 0"),
+        (b"abc", "x: bytes of 3"),
+        ("y" * 50, "x: str of 50 characters"),
+        ("yes", "x='yes'"),
+        (pd.DataFrame({"a": [1]}), "x: DataFrame"),
+        (2j, "x=2j"),
+        (len, "x: builtin_function_or_method"),
+    ],
+)
+def test_the_note_lists_only_arrays_as_arrays(value, text):
+    def fail(x):
+        raise ValueError
+
+    with pytest.raises(ValueError) as error:  # noqa: PT011 - its note is asked for
+        ep.CompGraphRunner(ep.CompGraph({"fail": fail}, {"fail": ("x", "y")})).run(x=value)
+    assert error.value.__notes__ == [f"In function 'fail': ({text}) -> (y)"]
 
 
 def test_an_unknown_target_is_named(chain):

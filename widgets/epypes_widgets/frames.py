@@ -12,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display import Marks, Most, Picture, Scene, encode_image, scene_of, scene_picture
+from epypes.images import has_colours
 from epypes.run import Run
 from epypes_widgets.histogram import histogram_of
 from epypes_widgets.values import json_values
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from epypes.display import Backdrop
     from epypes_widgets.screen import Shown
 
     Floats = npt.NDArray[np.float64]
@@ -132,6 +134,7 @@ def picture(
         "full_height": image.shape[0],
         "shape": " x ".join(map(str, image.shape)),
         "dtype": str(image.dtype),
+        "order": _order_text(run, found.backdrop),
     }
     return described, encoded.data
 
@@ -141,6 +144,14 @@ def _text_in_place(run: Run, token: str) -> str:
     if token not in run:
         return f"{token} has not been computed with these values."
     return f"{token}: nothing found." if run.tokens.is_nothing(token) else text_of(run[token])
+
+
+def _order_text(run: Run, backdrop: Backdrop) -> str:
+    """Return the order of an image's colours, and whether it is assumed; empty for one without colours."""
+    if not has_colours(backdrop.image):
+        return ""
+    is_assumed = run.cg.has_token(backdrop.name) and backdrop.name not in run.cg.colours
+    return backdrop.order + ", assumed" * is_assumed
 
 
 def text_of(value: Any) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from typing import Final
 
 # What a colour is called in the rules below -> what it is on paper, and what it is in a page: the theme of JupyterLab,
@@ -92,6 +93,44 @@ def _coloured(declarations: str) -> str:
 
 def _named(declarations: str) -> str:
     return re.sub(r"@(\w+)", r"var(--epypes-\1)", declarations)
+
+
+def paper_declarations(path: Sequence[tuple[str, Collection[str]]]) -> dict[str, str]:
+    """Return what the rules say of an element on paper: by property, the declaration that counts.
+
+    Parameters
+    ----------
+    path
+        Tag and classes of the elements that it is in, and of itself.
+    """
+    found: dict[str, str] = {}
+    for selector, declarations in _by_weight():
+        if _selects(selector, path):
+            found |= dict(part.split(":", 1) for part in declarations.split(";"))
+    return found
+
+
+@cache
+def _by_weight() -> list[tuple[list[str], str]]:
+    """Return selectors, as the parts that are inside each other, and declarations; those that count more come later."""
+    rules = [(re.split("[ >]", name)[1:], _coloured(declared)) for name, declared in _RULES.items() if name]
+    return sorted(rules, key=lambda rule: ("".join(rule[0]).count("."), len(rule[0])))
+
+
+def _selects(parts: Sequence[str], path: Sequence[tuple[str, Collection[str]]]) -> bool:
+    """Whether the last part means the last element, and the others mean elements around it, in this order."""
+    *outer, last = parts
+    if not path or not _means(last, *path[-1]):
+        return False
+    around = iter(path[:-1])
+    return all(any(_means(part, *element) for element in around) for part in outer)
+
+
+def _means(part: str, tag: str, classes: Collection[str]) -> bool:
+    if part.startswith(":not"):
+        return not _means(part[5:-1], tag, classes)
+    wanted, *names = part.split(".")
+    return (not wanted or wanted == tag) and all(name in classes for name in names)
 
 
 # A viewer that knows no variables skips the second part, and has what stands on paper.

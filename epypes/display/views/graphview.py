@@ -36,6 +36,8 @@ class TokenView(NamedTuple):
         That of its colours.
     first
         The text of the first value of a hyperparameter that has another one now; empty for all other tokens.
+    order_by
+        The function that says the order; empty if it is assumed.
     """
 
     name: str
@@ -44,6 +46,7 @@ class TokenView(NamedTuple):
     preview: Preview | None = None
     order: Order = "bgr"
     first: str = ""
+    order_by: str = ""
 
 
 class FunctionView(NamedTuple):

@@ -84,6 +84,11 @@ class Info(BaseModel):
     outputs: list[str]
     func_io: dict[str, Any] = Field(description="Input and output tokens by function.")
     rgb: list[str]
+    colours: dict[str, str] = Field(
+        default={},
+        description="By input and output that is an image, the order of its colours and what says it.",
+        examples=[{"image": "rgb, as in function 'gray'"}],
+    )
     threads: int
     revision: Revision
     addresses: dict[str, str] = Field(description="sub, pub, failures and http.")

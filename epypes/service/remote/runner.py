@@ -28,6 +28,7 @@ from epypes.service.remote.control import read_parameters
 from epypes.service.remote.runs import RemoteRuns, ShownRuns, remote_graph
 
 if TYPE_CHECKING:
+    from epypes.images import Order
     from epypes.service.remote.connection import Connection
 
 _log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ class RemoteRunner:
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         info, parameters = connection.info(), connection.parameters()
-        self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _rgb(connection, info))
+        self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _orders(connection, info))
         self._runs = RemoteRuns(connection, self.cg, parameters, info["outputs"])
         self._shown = ShownRuns()
         # Set to end the thread that follows the events; None without a thread.
@@ -392,9 +393,14 @@ def _process(info: Mapping[str, Any]) -> tuple[object, object]:
     return info.get("pid"), info.get("started_ns")
 
 
-def _rgb(connection: Connection, info: Mapping[str, Any]) -> list[str]:
-    """Return the tokens whose colours are RGB: of the whole graph, or of its ports where the view can't be read."""
+def _orders(connection: Connection, info: Mapping[str, Any]) -> dict[str, Order]:
+    """Return the orders of colours by token: of the whole graph, or of its ports where the view can't be read."""
     try:
-        return [str(token["name"]) for token in connection.view()["tokens"] if token.get("order") == "rgb"]
+        tokens = connection.view()["tokens"]
+        return {
+            str(token["name"]): "rgb" if token["order"] == "rgb" else "bgr"
+            for token in tokens
+            if token.get("order") == "rgb" or token.get("order_by")
+        }
     except (EpypesError, KeyError, TypeError, AttributeError):
-        return [str(token) for token in info.get("rgb", ())]
+        return {str(token): "rgb" for token in info.get("rgb", ())}

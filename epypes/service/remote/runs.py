@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from types import GenericAlias
@@ -16,7 +16,7 @@ from epypes.catalog import plain
 from epypes.errors import EpypesError, RemoteFailure, ServiceError
 from epypes.graph import CompGraph, colour_order, subgraph
 from epypes.hints import Param
-from epypes.images import Image
+from epypes.images import Image, Order
 from epypes.run import Failure, Run
 from epypes.run.result import RunImporter
 from epypes.service.parameters import Parameters
@@ -40,7 +40,10 @@ _TUPLES: Final = ("soft", "choices", "labels")
 
 
 def remote_graph(
-    url: str, func_io: Mapping[str, Sequence[Any]], entries: Mapping[str, Mapping[str, Any]], rgb: Iterable[str]
+    url: str,
+    func_io: Mapping[str, Sequence[Any]],
+    entries: Mapping[str, Mapping[str, Any]],
+    orders: Mapping[str, Order],
 ) -> CompGraph:
     """Return the graph of a service, whose functions say where they run when they are called here.
 
@@ -52,15 +55,15 @@ def remote_graph(
         As JSON has it: lists are tuples.
     entries
         Of the hyperparameters, by token: their ranges become annotations.
-    rgb
-        The tokens whose colours are RGB.
+    orders
+        The orders of colours by token, where a function of the service says them.
 
     Raises
     ------
     GraphError
         This is no graph.
     """
-    hints: dict[str, Any] = {token: Annotated[Any, Image(order="rgb")] for token in rgb}
+    hints: dict[str, Any] = {token: Annotated[Any, Image(order=order)] for token, order in orders.items()}
     for token, entry in entries.items():
         known: dict[str, Any] = {
             key: tuple(entry[key]) if key in _TUPLES else entry[key]

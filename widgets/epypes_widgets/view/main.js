@@ -42,7 +42,7 @@ function headerPart() {
       if (passes) noted = "";
       show();
       say(token, frame.token);
-      say(kind, main.shape ? `${main.dtype} ${main.shape}` : "");
+      say(kind, main.shape ? `${main.dtype} ${main.shape} ${main.order ?? ""}`.trim() : "");
       say(marks, overlayCount(main.overlay));
       say(count, `${frame.ran} ran, ${frame.reused} reused${frame.skipped ? `, ${frame.skipped} skipped` : ""}`);
       note(count, "title", Object.entries(frame.times_ms).map(([name, ms]) => `${name}: ${inMs(ms)}`).join("\n"));

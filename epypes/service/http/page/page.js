@@ -39,6 +39,7 @@ async function loadInfo() {
     "events at": info.addresses.sub,
     "answers at": info.addresses.pub,
     "failures at": info.addresses.failures,
+    ...Object.fromEntries(Object.entries(info.colours ?? {}).map(([token, text]) => [`colours of ${token}`, text])),
   };
   sawPlace(info.addresses.sub, info.counts.answered > 0);
   part("facts").replaceChildren(...Object.entries(facts).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text))));
