@@ -29,9 +29,10 @@ from typing import Any, Final
 from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import is_set_by_runs
 from epypes.bundle.expressions import is_data
-from epypes.bundle.load import execute
 from epypes.bundle.manifest import MODULE
-from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, without_nodes
+from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, is_installed, module_reads, without_nodes
+from epypes.bundle.own_modules import OwnModules
+from epypes.bundle.private_import import PrivateImport
 from epypes.bundle.references import meanings_of, nested_codes
 from epypes.bundle.resolve import (
     annotated_names,
@@ -82,7 +83,7 @@ Pair = tuple[str, Any, Any]
 _Definition = ast.FunctionDef | ast.Lambda
 
 
-def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], arrays: ArrayFiles | None = None) -> str:
+def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], *files: ArrayFiles | OwnModules) -> str:
     """Execute a module that was emitted, and return why its objects are not the notebook's; "" if they are.
 
     Parameters
@@ -91,25 +92,26 @@ def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], arrays: ArrayFile
         The module.
     pairs
         Returns of the module what is compared: how a reason calls an object, the notebook's object and the module's.
-    arrays
-        What it reads from files.
+    files
+        What it reads and imports from the bundle.
     """
     with tempfile.TemporaryDirectory(prefix=_DRAFT) as folder:
         path = Path(folder) / MODULE
         path.write_text(text, encoding="utf-8")
-        if arrays is not None:
-            arrays.write(path.parent)
+        for each in files:
+            each.write(path.parent)
         try:
             return _refusal(path, pairs)
         finally:
-            linecache.cache.pop(str(path), None)
+            for file in [file for file in linecache.cache if file.startswith(folder)]:
+                del linecache.cache[file]
 
 
 def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]]) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the notebook has shown them
-            module = execute(path, path.read_bytes())
+            module = PrivateImport(path.parent).execute(path)
     except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         where = f", at {str(frames[0].line)!r}" if frames else ""
@@ -164,7 +166,8 @@ class _Walk:
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
         try:
-            if isinstance(ours, types.ModuleType | CompGraphRunner):
+            is_installed_module = isinstance(ours, types.ModuleType) and is_installed(ours.__name__)
+            if is_installed_module or isinstance(ours, CompGraphRunner):
                 raise TypeError("what a module holds, and a runner's last run, is no part of its description")
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
@@ -188,6 +191,11 @@ class _Walk:
             names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
+        if isinstance(ours, types.FunctionType):
+            read, others_read = ({f" {name!r}": part for name, part in module_reads(one)} for one in (ours, theirs))
+            # Of a package, the notebook may have modules that no code of the bundle imports.
+            extra = {name for name in read.keys() - others_read if isinstance(read[name], types.ModuleType)}
+            self._add_all(path, {name: part for name, part in read.items() if name not in extra}, others_read)
 
     def _add_all(self, path: _Path, mine: Mapping[str, Any], others: Mapping[str, Any]) -> None:
         """Add parts by name, which must be the same in the same order."""

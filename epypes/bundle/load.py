@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-import threading
 import traceback
-import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,8 +10,17 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
 from epypes.bundle.arrays import StoredArray, read_array
-from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, bundle_files, check_manifest
+from epypes.bundle.manifest import (
+    MODULE,
+    OWN_MODULES,
+    REQUIREMENTS,
+    SAMPLES,
+    SETTINGS,
+    bundle_files,
+    check_manifest,
+)
 from epypes.bundle.mutable_state import MutableState
+from epypes.bundle.private_import import PrivateImport
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -23,8 +29,6 @@ from epypes.run import CompGraphRunner
 from epypes.run.guard import called_for
 
 MAKER: Final = "make_pipeline"
-# Two bundles of one name must not take each other's place among the modules.
-_EXECUTING: Final = threading.RLock()
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -90,7 +94,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
             if MODULE not in files:
                 raise BundleError(folder, f"{folder} has no {MODULE}. Promote the graph again.")
             for file in files:
-                if file.endswith(".npy"):
+                if file.endswith(".npy") and not file.startswith(f"{OWN_MODULES}/"):
                     read_array(folder / file, "r")
             module = _imported(folder)
             enums = getattr(module, "enums", {})
@@ -124,7 +128,7 @@ def _imported(folder: Path) -> Any:
     """Execute a bundle's module; what it can't import is named with the way out."""
     path = folder / MODULE
     try:
-        return execute(path, path.read_bytes())
+        return PrivateImport(folder).execute(path)
     except ImportError as error:
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         where = f" at line {frames[-1].lineno}, {frames[-1].line!r}" if frames else ""
@@ -149,24 +153,6 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_ino, found.st_ctime_ns
-
-
-def execute(path: Path, source: bytes) -> Any:
-    """Execute the module's source as it was checked; a cached .pyc, which the manifest does not cover, is not read."""
-    module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
-    module.__file__ = str(path)
-    # While their module runs, dataclasses look for it there.
-    with _EXECUTING:
-        before = sys.modules.get(module.__name__)
-        sys.modules[module.__name__] = module
-        try:
-            exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)  # noqa: S102 - its purpose
-        finally:
-            if before is None:
-                del sys.modules[module.__name__]
-            else:
-                sys.modules[module.__name__] = before
-    return module
 
 
 def load(path: str | Path) -> CompGraphRunner:
