@@ -23,16 +23,16 @@ import types
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Final
 
 from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import is_set_by_runs
 from epypes.bundle.expressions import is_data
-from epypes.bundle.manifest import MODULE
+from epypes.bundle.manifest import MODULE, OWN_MODULES
 from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, is_installed, module_reads, without_nodes
 from epypes.bundle.own_modules import OwnModules
-from epypes.bundle.private_import import PrivateImport
+from epypes.bundle.private_import import PrivateImport, plain_name
 from epypes.bundle.references import meanings_of, nested_codes
 from epypes.bundle.resolve import (
     annotated_names,
@@ -48,7 +48,8 @@ from epypes.run import CompGraphRunner
 
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
-    "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token."
+    "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token. "
+    "After a change of a module's file, restart the kernel first."
 )
 
 
@@ -116,7 +117,7 @@ def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]]) -> str:
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         where = f", at {str(frames[0].line)!r}" if frames else ""
         return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}"
-    walk = _Walk()
+    walk = _Walk(path.parent / OWN_MODULES)
     walk.waiting.extend((_Path(what, _placed(what, ours)), ours, theirs) for what, ours, theirs in pairs(module))
     try:
         walk.finish()
@@ -126,9 +127,16 @@ def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]]) -> str:
 
 
 class _Walk:
-    """A walk over two graphs of objects that compares each pair of objects once."""
+    """A walk over two graphs of objects that compares each pair of objects once.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    modules
+        The folder of the modules that the draft has taken along.
+    """
+
+    def __init__(self, modules: Path) -> None:
+        self._modules = modules
         self.waiting: deque[tuple[_Path, Any, Any]] = deque()
         # The objects by their ids. They are kept here, so that no id is used again.
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
@@ -141,6 +149,8 @@ class _Walk:
         while self.waiting:
             path, ours, theirs = self.waiting.popleft()
             ours, theirs = without_nodes(ours), without_nodes(theirs)
+            if isinstance(theirs, str | PurePath) and type(ours) is type(theirs) and self._is_moved(ours, theirs):
+                continue
             self._compare_identity(path, ours, theirs)
             if ours is not theirs and (id(ours), id(theirs)) not in self._seen:
                 self._seen[id(ours), id(theirs)] = ours, theirs
@@ -148,6 +158,15 @@ class _Walk:
         for has_equals, difference in self._divided.items():
             if self._asks_for_identity or (self._asks_for_membership and not has_equals):
                 raise difference
+
+    def _is_moved(self, ours: Any, theirs: Any) -> bool:
+        """Whether these are the name, or the path, of one module or of a file beside it, here and in the draft."""
+        if isinstance(theirs, str) and plain_name(theirs) != theirs:
+            return plain_name(theirs) == plain_name(ours)
+        if not PurePath(theirs).is_relative_to(self._modules):
+            return False
+        parts = PurePath(theirs).relative_to(self._modules).parts
+        return PurePath(ours).is_absolute() and (not parts or PurePath(ours).parts[-len(parts) :] == parts)
 
     def _compare_identity(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Note an object of one side that is several objects of the other."""

@@ -111,8 +111,9 @@ class FileAccess:
         frame: FrameType | None = sys._getframe(2)
         while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
             file, name = Path(frame.f_code.co_filename), frame.f_code.co_name
-            if file.parent == self._folder:
-                return f"{'The module' if name == '<module>' else f'{name}()'} ({file.name}, line {frame.f_lineno})"
+            if file.is_relative_to(self._folder):
+                where = f"{file.relative_to(self._folder).as_posix()}, line {frame.f_lineno}"
+                return f"{'The module' if name == '<module>' else f'{name}()'} ({where})"
             frame = frame.f_back
         return ""
 

@@ -29,6 +29,10 @@ from epypes.run import CompGraphRunner
 from epypes.run.guard import called_for
 
 MAKER: Final = "make_pipeline"
+MODULES_OF_A_BUNDLE: Final = (
+    "A bundle imports installed packages, and the modules of the project that its code named when it was promoted: "
+    f"install what its {REQUIREMENTS} lists, or import the module by name and promote it again"
+)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -130,11 +134,12 @@ def _imported(folder: Path) -> Any:
     try:
         return PrivateImport(folder).execute(path)
     except ImportError as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        frames = [
+            frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(folder))
+        ]
+        path = Path(frames[-1].filename) if frames else path
         where = f" at line {frames[-1].lineno}, {frames[-1].line!r}" if frames else ""
-        text = f"{path} can't be imported{where}: {type(error).__name__}: {error}"
-        way_out = "Only installed packages can be imported in a bundle: install what its"
-        text = f"{text}. {way_out} {REQUIREMENTS} lists, or move the code into the notebook and promote it again."
+        text = f"{path} can't be imported{where}: {type(error).__name__}: {error}. {MODULES_OF_A_BUNDLE}."
         raise BundleError(folder, text) from error
 
 

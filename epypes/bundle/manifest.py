@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import hashlib
+import importlib.util
 import os
 import platform
 import stat
@@ -200,6 +201,16 @@ def is_module(name: str) -> bool:
 def module_files(folder: Path) -> list[Path]:
     """Return the files of a bundle that are Python code: ``pipeline.py`` and the modules of the user's project."""
     return [folder / MODULE, *sorted((folder / OWN_MODULES).rglob("*.py"))]
+
+
+def code_of(folder: Path) -> str:
+    """Return the text of all Python code of a bundle, one file after another, to look for names and imports in it."""
+    return "\n".join(importlib.util.decode_source(file.read_bytes()) for file in module_files(folder))
+
+
+def own_packages(folder: Path) -> frozenset[str]:
+    """Return the outermost packages and modules of the user's project that a bundle has."""
+    return frozenset(path.name.removesuffix(".py") for path in (folder / OWN_MODULES).glob("*"))
 
 
 def _hash(path: Path) -> str:

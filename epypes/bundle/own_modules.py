@@ -26,7 +26,6 @@ from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-import epypes
 from epypes.bundle.manifest import OWN_MODULES
 from epypes.bundle.objects import ATOMS, describe, is_installed, is_of_library, module_reads, without_nodes
 from epypes.bundle.private_import import loaded_module, plain_name
@@ -45,7 +44,7 @@ from epypes.run.guard import is_plain_array
 _INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
 _PYTHON: Final = Path(os.__file__).resolve().parent
 # What lies beside EPypes is of its own project.
-_BESIDE_EPYPES: Final = Path(epypes.__file__).resolve().parents[1]
+_BESIDE_EPYPES: Final = Path(__file__).resolve().parents[2]
 _PICKLES: Final = frozenset({".pkl", ".pickle", ".joblib"})
 _RESTART: Final = "Restart the kernel, or call importlib.reload() with it, and run the cells again"
 _PATH_FUNCTIONS: Final[tuple[Any, ...]] = (
@@ -217,8 +216,8 @@ class OwnModules:
         for node in nodes:
             if _is_anchored(node, names, module.root):
                 whole = node
-                while isinstance(_path_value(parents.get(whole), names), str | PurePath):
-                    whole = parents[whole]
+                while isinstance(_path_value(_around(whole, parents), names), str | PurePath):
+                    whole = _around(whole, parents)
                 is_named.update(ast.walk(whole))
                 self._take(whole, parents.get(whole), module, names)
         docstrings = {node.value for node in nodes if isinstance(node, ast.Expr)}
@@ -361,6 +360,13 @@ def _is_anchored(node: ast.AST, names: Mapping[str, Any], root: Path) -> bool:
     return isinstance(value, str | PurePath) and os.path.isabs(value) and Path(value).is_relative_to(root)
 
 
+def _around(node: ast.AST, parents: Mapping[ast.AST, ast.AST]) -> Any:
+    """Return the expression around one; around what a method is called on, the call."""
+    parent = parents.get(node)
+    is_method = isinstance(parent, ast.Attribute) and parent.attr in _PATH_METHODS
+    return parents.get(parent) if is_method and parent is not None else parent
+
+
 def _path_value(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
     """Return the value of an expression that makes a path of names, texts and functions for paths; else _UNKNOWN."""
     try:
@@ -391,8 +397,8 @@ def _evaluated(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
             return str(_known(_evaluated(inner, names)))
         case ast.JoinedStr(values=values):
             return "".join(_known(_evaluated(value, names)) for value in values)
-        case ast.Call(func=function, args=arguments, keywords=[]):
-            return _called(function, [_known(_evaluated(argument, names)) for argument in arguments], names)
+        case ast.Call(keywords=[]):
+            return _called(node, [_known(_evaluated(argument, names)) for argument in node.args], names)
     return _UNKNOWN
 
 
@@ -402,24 +408,23 @@ def _known(value: Any) -> Any:
     return value
 
 
-def _called(node: ast.expr, arguments: list[Any], names: Mapping[str, Any]) -> Any:
-    if isinstance(node, ast.Attribute) and node.attr in _PATH_METHODS:
-        value = _evaluated(node.value, names)
+def _called(node: ast.Call, arguments: list[Any], names: Mapping[str, Any]) -> Any:
+    if isinstance(node.func, ast.Attribute) and node.func.attr in _PATH_METHODS:
+        value = _evaluated(node.func.value, names)
         if isinstance(value, PurePath):
-            return getattr(value, node.attr)(*arguments)
-    function = _evaluated(node, names)
+            return getattr(value, node.func.attr)(*arguments)
+    function = _evaluated(node.func, names)
     home = str(getattr(function, "__module__", ""))
     is_reader = home.startswith(("importlib.resources", "pkgutil")) and function.__name__ in _RESOURCE_READERS
     if not is_reader and not any(function is one for one in _PATH_FUNCTIONS):
         return _UNKNOWN
     if is_reader or function is importlib.resources.files:
         package, *parts = arguments
-        if isinstance(package, str) and package not in (names.get("__package__"), names.get("__name__")):
-            way_out = f"{function.__name__}(__package__)"
-            raise Refused(
-                f"Module {plain_name(str(names.get('__name__')))!r} reads files by {ast.unparse(node)}({package!r}), "
-                f"which a bundle has under another name. Write {way_out}, and the rest of the path behind it."
-            )
+        if isinstance(node.args[0], ast.Constant) and not is_installed(package):
+            what = f"Module {plain_name(str(names['__name__']))!r} reads files by {ast.unparse(node)}"
+            place = place_in(str(names.get("__file__")), node.lineno)
+            way_out = f"Write {ast.unparse(node.func)}(__package__), and the rest of the path behind it."
+            raise Refused(f"{what} ({place}), which a bundle has under another name. {way_out}")
         found = importlib.resources.files(package)
         return found.joinpath(*parts) if parts else found
     return function(*arguments)

@@ -126,7 +126,7 @@ class PrivateImport:
 
     def spec_of(self, full: str) -> ModuleSpec | None:
         """Return how a module of the bundle is loaded; None if it has none of this name."""
-        place = plain_name(full).replace(".", "/")
+        place = full[len(self.name) + 1 :].replace(".", "/") or "."
         is_package = f"{place}/__init__.py" in self._sources
         if not is_package and f"{place}.py" in self._sources:
             path = str(self._root / f"{place}.py")
@@ -134,6 +134,7 @@ class PrivateImport:
         if place not in self._folders:
             return None
         path = str(self._root / place / "__init__.py")
+        # Also the folder itself, which all names begin with.
         spec = ModuleSpec(full, _Loader(self, full, path), origin=path if is_package else None, is_package=True)
         spec.has_location = is_package
         spec.submodule_search_locations = [str(self._root / place)]
@@ -169,12 +170,15 @@ class _Loader(SourceFileLoader):
 
 
 class _Finder:
-    """Finds the modules of all bundles by the names that no import statement has, as ``importlib.resources`` asks."""
+    """The finder of the modules of all bundles, by the names that no import statement has.
+
+    ``importlib.resources`` asks for one when a function calls it; from then on that is in ``sys.modules``.
+    """
 
     @staticmethod
     def find_spec(fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
         own = _IMPORTS.get(fullname.partition(".")[0])
-        return own.spec_of(fullname) if own is not None and "." in fullname else None
+        return own.spec_of(fullname) if own is not None else None
 
 
 def _below(root: Path, path: Path) -> str:

@@ -176,7 +176,8 @@ def check_reads(found: Definition, known: Patches) -> None:
             if owner is not None:
                 raise _patched(found.what, f"{owner.__name__}.{name}", place)
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
-    for owner, name in _read_by(found.node, names):
+    home = loaded_module(str(found.names.get("__name__")))
+    for owner, name in (*_read_by(found.node, names), *((home, name) for name in found.reads())):
         if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
             owner, name = of_classes.get(name, (None, name))
         place = _place_of_patch(known, owner, name, found.place_in(found.node))
