@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from epypes.bundle.manifest import MODULE
 
-_SYSTEM: Final = (
+ON_EVERY_MACHINE: Final = (
     *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
     *("/System", "/Library", "/var/cache", "/var/lib"),
 )
@@ -89,7 +89,7 @@ class FileAccess:
         home = Path("~").expanduser()
         packages = (module for name, module in [*sys.modules.items()] if "." not in name)
         folders = [
-            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, *_SYSTEM),
+            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, *ON_EVERY_MACHINE),
             *(folder for module in packages for folder in getattr(module, "__path__", ())),
             *(os.environ.get("XDG_CACHE_HOME", home / ".cache"), os.environ.get("XDG_CONFIG_HOME", home / ".config")),
         ]

@@ -19,17 +19,18 @@ import os
 import shutil
 import sys
 import types
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from pathlib import Path, PurePath
 from typing import Any, Final
 
+from epypes.bundle.file_access import ON_EVERY_MACHINE
 from epypes.bundle.manifest import OWN_MODULES
 from epypes.bundle.objects import ATOMS, describe, is_installed, is_of_library, module_reads, without_nodes
 from epypes.bundle.private_import import loaded_module, plain_name
-from epypes.bundle.references import captured_by, imports_in, namespace_of
+from epypes.bundle.references import captured_by, imports_in, is_main_guard, namespace_of
 from epypes.bundle.resolve import Definition, Refused, definition_of, place_in
 from epypes.bundle.side_effects import (
     Patches,
@@ -96,6 +97,12 @@ class OwnModules:
         self._files: dict[str, bytes | Path] = {}
         self._modules: dict[str, _OwnModule] = {}
         self._seen: set[str] = set()
+        # By module: its names for paths that are made of __file__.
+        self._anchors: dict[str, set[str]] = {}
+        self._collect(names)
+
+    def _collect(self, names: Iterable[str]) -> None:
+        """Take modules along, and what they import."""
         waiting = [*names]
         while waiting:
             # With its packages, whose __init__ is executed first.
@@ -136,7 +143,7 @@ class OwnModules:
         relative = f"{name.replace('.', '/')}{'/__init__' if path.name == '__init__.py' else ''}.py"
         if root / relative != path or path.suffix != ".py":
             raise Refused(f"Module {name!r} is not at the place that its name says: {path}. Put it there.")
-        tree.body = [node for node in tree.body if not _is_main_guard(node)]
+        tree.body = [node for node in tree.body if not is_main_guard(node)]
         package = full if path.name == "__init__.py" else full.rpartition(".")[0]
         self._put(relative, source, f"Module {name!r}", path)
         names = getattr(loaded_module(full), "__dict__", {"__name__": full, "__package__": package})
@@ -172,6 +179,11 @@ class OwnModules:
         """
         if not self._modules:
             return
+        functions = sorted(_reached(values), key=lambda function: function.__code__.co_filename)
+        # A package may import what a function needs only when it is asked for, by a name that no text has.
+        homes = {str(function.__globals__.get("__name__")): function.__globals__ for function in functions}
+        loaded = {name: loaded_module(name) for name in homes if name != "__main__"}
+        self._collect(name for name, module in loaded.items() if module and vars(module) is homes[name])
         by_file = {str(module.file): module for module in self._modules.values()}
         own_patches = {
             key: place
@@ -180,9 +192,10 @@ class OwnModules:
             if is_installed(str(getattr(key[0], "__module__", None) or key[0].__name__))
         }
         known = {**patches, **own_patches}
+        self._anchors = self._find_anchors()
         checks: list[tuple[Sequence[ast.AST], Definition | None, _OwnModule]]
         checks = [(module.tree.body, None, module) for module in self._modules.values()]
-        for function in sorted(_reached(values), key=lambda function: function.__code__.co_filename):
+        for function in functions:
             home = by_file.get(function.__code__.co_filename)
             if home is None or function.__code__.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
                 continue
@@ -208,28 +221,70 @@ class OwnModules:
         names = {**module.names, **(imported_by(found) if found is not None else {})}
         nodes = [*_executed(body, into_functions=found is not None)]
         parents = {child: node for node in nodes for child in ast.iter_child_nodes(node)}
+        anchors = set(self._anchors[module.name])
+        if found is not None:
+            for node in nodes:
+                if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                    value, name = _path_value(node.value, names), node.targets[0].id
+                    names |= {name: value} if isinstance(value, str | PurePath) else {}
+                    anchors |= {name} if self._has_anchor(node.value, anchors, names) else set()
+        is_named: set[ast.AST | None] = set()
         for node in nodes:
-            if found is not None and isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                value = _path_value(node.value, names)
-                names |= {node.targets[0].id: value} if isinstance(value, str | PurePath) else {}
-        is_named = set[ast.AST]()
-        for node in nodes:
-            if _is_anchored(node, names, module.root):
+            if self._is_anchor(node, anchors, names):
                 whole = node
                 while isinstance(_path_value(_around(whole, parents), names), str | PurePath):
                     whole = _around(whole, parents)
                 is_named.update(ast.walk(whole))
-                self._take(whole, parents.get(whole), module, names)
-        docstrings = {node.value for node in nodes if isinstance(node, ast.Expr)}
+                if isinstance(_path_value(whole, names), str | PurePath):
+                    self._take(whole, parents.get(whole), module, names)
+        # Docstrings; and texts of the module's constants, which count where a function reads them.
+        unread = {node.value for node in nodes if isinstance(node, ast.Expr)} | is_named
+        unread |= {node.value for node in nodes if found is None and isinstance(node, ast.Assign | ast.AnnAssign)}
         for node in nodes:
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in docstrings | is_named:
-                _check_text(node.value, module, module.place_in(node))
+            text = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
+            text = names.get(node.id) if found is not None and isinstance(node, ast.Name) else text
+            if type(text) is str and node not in unread:
+                _check_text(text, module, module.place_in(node))
+
+    def _find_anchors(self) -> dict[str, set[str]]:
+        """Return by module the names of paths that are made of ``__file__``, also those taken from other modules."""
+        found = {name: {"__file__"} for name in self._modules}
+        self._anchors, before = found, 0
+        while before != (before := sum(map(len, found.values()))):
+            for module in self._modules.values():
+                own = found[module.name]
+                for node in module.tree.body:
+                    if isinstance(node, ast.ImportFrom):
+                        source = found.get(plain_name(imports_in(ast.Module([node], []), module.names)[0]), set())
+                        own |= {alias.asname or alias.name for alias in node.names if alias.name in source}
+                    elif isinstance(node, ast.Assign | ast.AnnAssign) and self._has_anchor(
+                        node.value, own, module.names
+                    ):
+                        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                        own |= {target.id for target in targets if isinstance(target, ast.Name)}
+        return found
+
+    def _has_anchor(self, tree: ast.AST | None, anchors: Collection[str], names: Mapping[str, Any]) -> bool:
+        return tree is not None and any(self._is_anchor(node, anchors, names) for node in ast.walk(tree))
+
+    def _is_anchor(self, node: ast.AST, anchors: Collection[str], names: Mapping[str, Any]) -> bool:
+        """Whether a part of an expression is a path of the module's own place, or a call that reads beside it."""
+        match node:
+            case ast.Name(id=name, ctx=ast.Load()):
+                return name in anchors
+            case ast.Attribute(value=inner, attr=name):
+                home = _path_value(inner, names)
+                is_own = isinstance(home, types.ModuleType)
+                return is_own and name in self._anchors.get(plain_name(home.__name__), ())
+            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)):
+                return name in {*_RESOURCE_READERS, "files"} and isinstance(_path_value(node, names), PurePath)
+        return False
 
     def _take(self, whole: ast.AST, parent: ast.AST | None, module: _OwnModule, names: Mapping[str, Any]) -> None:
         path, place = Path(_path_value(whole, names)), module.place_in(whole)
         is_kept = isinstance(parent, ast.Assign | ast.AnnAssign)
         is_search_path = isinstance(parent, ast.Call) and ast.unparse(parent.func).startswith("sys.path.")
-        if path.is_dir() and (is_kept or is_search_path):
+        if is_search_path or (path.is_dir() and is_kept):
             return
         what = f"{module.what} reads files beside itself ({place}: {ast.unparse(whole)})"
         if path.is_dir():
@@ -239,12 +294,14 @@ class OwnModules:
             )
         if not path.is_file():
             raise Refused(f"{what}: {path}, which is not there. Make the file, or pass its content in as a token.")
-        if not path.is_relative_to(module.root):
+        # The project may lie behind a link, which a function has resolved.
+        roots = [root for root in (module.root, module.root.resolve()) if path.is_relative_to(root)]
+        if not roots:
             raise Refused(f"{what}: {path} is outside of {module.root}. Put it beside the module, or make it a token.")
         if path.suffix.lower() in _PICKLES:
             raise Refused(f"{what}: {path} is a pickle, which no bundle holds. Save its arrays by numpy.savez.")
         if path != module.file:
-            self._put(path.relative_to(module.root).as_posix(), path, "File", path)
+            self._put(path.relative_to(roots[0]).as_posix(), path, "File", path)
 
 
 def _check_is_known(name: str, full: str) -> None:
@@ -256,11 +313,14 @@ def _check_is_known(name: str, full: str) -> None:
 
 
 def _check_text(text: str, module: _OwnModule, place: str) -> None:
-    """Refuse a text that names a file in the current folder, which is another one where the bundle runs."""
-    if "\0" not in text and not os.path.isabs(text) and PurePath(text).suffix and os.path.isfile(text):
-        what = f"{module.what} names the file {text!r} in the current folder ({place})"
-        way_out = f"Put it beside the module and write Path(__file__).parent / {PurePath(text).name!r}"
-        raise Refused(f"{what}, which is another one in a service. {way_out}, or pass its content in as a token.")
+    """Refuse a text that names a file of this machine, which is not there, or another one, where the bundle runs."""
+    path = PurePath(text)
+    # A folder such as /tmp or /data is on every machine.
+    is_here = path.parts[2:] and not text.startswith(ON_EVERY_MACHINE) if path.is_absolute() else path.suffix
+    if is_here and _INSTALLED.isdisjoint(path.parts) and os.path.exists(text):
+        what = f"{module.what} names {text!r}{'' if path.is_absolute() else ', a file in the current folder'} ({place})"
+        way_out = f"Put it beside the module and write Path(__file__).parent / {path.name!r}"
+        raise Refused(f"{what}, which a service has not. {way_out}, or pass its content in as a token.")
 
 
 def _definition(function: types.FunctionType, module: _OwnModule) -> Definition:
@@ -329,13 +389,6 @@ def _is_of_project(path: Path, root: Path) -> bool:
     return not is_installed and not whole.is_relative_to(_PYTHON) and root.resolve() != _BESIDE_EPYPES
 
 
-def _is_main_guard(node: ast.stmt) -> bool:
-    return isinstance(node, ast.If) and ast.unparse(node.test).replace('"', "'") in (
-        "__name__ == '__main__'",
-        "'__main__' == __name__",
-    )
-
-
 def _executed(body: Iterable[ast.AST], *, into_functions: bool) -> Iterator[ast.AST]:
     """Give the nodes of some statements; those in functions only if asked for."""
     for node in body:
@@ -347,17 +400,6 @@ def _executed(body: Iterable[ast.AST], *, into_functions: bool) -> Iterator[ast.
 
 
 # -- paths -------------------------------------------------------------------------------------------------------------
-
-
-def _is_anchored(node: ast.AST, names: Mapping[str, Any], root: Path) -> bool:
-    """Whether a name, an attribute or a call is a path inside a folder, by which files there can be reached."""
-    if not isinstance(node, ast.Name | ast.Attribute | ast.Call) or isinstance(getattr(node, "ctx", None), ast.Store):
-        return False
-    value = _path_value(node, names)
-    if isinstance(node, ast.Call):
-        function = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        return function in {*_RESOURCE_READERS, "files"} and isinstance(value, PurePath)
-    return isinstance(value, str | PurePath) and os.path.isabs(value) and Path(value).is_relative_to(root)
 
 
 def _around(node: ast.AST, parents: Mapping[ast.AST, ast.AST]) -> Any:

@@ -86,6 +86,12 @@ def module_of_import(node: ast.Import | ast.ImportFrom, alias: ast.alias, names:
     return importlib.util.resolve_name("." * node.level + (node.module or ""), names.get("__package__") or "")
 
 
+def is_main_guard(node: ast.stmt) -> bool:
+    """Whether a statement is executed only where its file is run as a program."""
+    test = ast.unparse(node.test).replace('"', "'") if isinstance(node, ast.If) else ""
+    return test in ("__name__ == '__main__'", "'__main__' == __name__")
+
+
 def cells_of(function: types.FunctionType) -> dict[str, types.CellType]:
     """Return the variables that a function has captured, by name; not those without a value."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)

@@ -23,6 +23,7 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
 from epypes.bundle.manifest import REQUIREMENTS
+from epypes.bundle.references import is_main_guard
 from epypes.errors import BundleError
 
 INSTALL_TIMEOUT_S: Final = 1200.0
@@ -47,7 +48,9 @@ def imported_names(text: str, own: Collection[str] = ()) -> frozenset[str]:
     packages are not.
     """
     found: set[str] = set()
-    for node in ast.walk(ast.parse(text)):
+    tree = ast.parse(text)
+    tree.body = [node for node in tree.body if not is_main_guard(node)]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

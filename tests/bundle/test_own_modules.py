@@ -286,7 +286,11 @@ READS = {
     "a file that is not there": ("(HERE / 'gone.txt').exists() or x", r"gone\.txt, which is not there"),
     "a file outside": ("np.loadtxt(HERE.parent.parent / 'out.txt')", r"out\.txt is outside of .*project"),
     "a pickle": ("np.load(HERE / 'model.pkl', allow_pickle=True)", r"model\.pkl is a pickle"),
-    "the current folder": ("np.loadtxt('here.txt')", r"names the file 'here\.txt' in the current folder \(.*line 6\)"),
+    "the current folder": ("np.loadtxt('here.txt')", r"names 'here\.txt', a file in the current folder \(.*line 6\)"),
+    "an absolute path": (
+        "np.loadtxt(ABSOLUTE)",
+        r"names '/.*/project/lib/a\.txt' \(.*line 6\), which a service has not",
+    ),
     "a package by name": (
         "files('lib').joinpath('a.txt') and x",
         r"files\('lib'\) \(.*line 6\), which .*Write files\(__package__\)",
@@ -297,7 +301,8 @@ READS = {
 @pytest.mark.parametrize("case", READS)
 def test_other_files_are_refused_by_name(case, project, tmp_path, monkeypatch):
     source, words = READS[case]
-    head = "from importlib.resources import files\nfrom pathlib import Path\nimport numpy as np\nHERE = Path(__file__).parent\n"
+    head = "from importlib.resources import files\nfrom pathlib import Path\nimport numpy as np\nHERE = Path(__file__).parent; "
+    head += f"UNREAD = ABSOLUTE = {str(project.folder / 'lib' / 'a.txt')!r}\n"
     project.write(lib__init="", lib__data=f"{head}def f(x):\n    return {source} if x.any() else x\n")
     for name in ("../out.txt", "lib/2.txt", "lib/model.pkl", "here.txt", "lib/a.txt"):
         (project.folder / name).write_text("1\n")
@@ -363,7 +368,7 @@ HOSTILE = {
     "the notebook as a module": ("import __main__\ndef f(x):\n    return x\n", "", r"imports the notebook itself"),
     "code that the notebook replaces": (
         "def g(x):\n    return x\ndef f(x):\n    return g(x)\n",
-        "lib.g.__code__ = (lambda x: 3 * x).__code__",
+        "vars(lib)['g'].__code__ = (lambda x: 3 * x).__code__",
         r"the notebook has it with another text",
     ),
 }
