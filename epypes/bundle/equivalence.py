@@ -30,7 +30,16 @@ from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import is_set_by_runs
 from epypes.bundle.expressions import is_data
 from epypes.bundle.manifest import MODULE, OWN_MODULES
-from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, is_installed, module_reads, without_nodes
+from epypes.bundle.objects import (
+    ANNOTATION,
+    ATOMS,
+    CODE,
+    describe,
+    is_installed,
+    is_of_library,
+    module_reads,
+    without_nodes,
+)
 from epypes.bundle.own_modules import OwnModules
 from epypes.bundle.private_import import PrivateImport, plain_name
 from epypes.bundle.references import meanings_of, nested_codes
@@ -210,7 +219,7 @@ class _Walk:
             names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
-        if isinstance(ours, types.FunctionType):
+        if isinstance(ours, types.FunctionType) and not is_of_library(ours):
             read, others_read = ({f" {name!r}": part for name, part in module_reads(one)} for one in (ours, theirs))
             # Of a package, the notebook may have modules that no code of the bundle imports.
             extra = {name for name in read.keys() - others_read if isinstance(read[name], types.ModuleType)}

@@ -63,7 +63,7 @@ _SINGLE_DISPATCH: Final = frozenset(nested_codes(functools.singledispatch.__code
 # Builtins by which code reads attributes that its names don't say.
 ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
 # The folders that pip, and Debian's packages, install into.
-_INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
+INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
 _NUMBERS_AND_TEXTS: Final[tuple[Any, ...]] = (tuple, str, bytes, int, float, complex)
 _CONTENTS: Final[Mapping[type, Callable[[Any], Any]]] = {
     **{kind: kind.__getnewargs__ for kind in _NUMBERS_AND_TEXTS},
@@ -399,7 +399,7 @@ def will_be_installed(module: str) -> bool:
     if loaded_module(top):
         return is_installed(top)
     spec = importlib.util.find_spec(top)
-    return spec is not None and not _INSTALLED.isdisjoint(Path(spec.origin or "").parts)
+    return spec is not None and not INSTALLED.isdisjoint(Path(spec.origin or "").parts)
 
 
 def module_reads(function: types.FunctionType) -> list[tuple[str, Any]]:

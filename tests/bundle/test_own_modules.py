@@ -278,22 +278,24 @@ def test_files_that_the_text_names_come_along(project):
 
 
 READS = {
-    "a name that is computed": ("np.loadtxt(HERE / f'{len(x)}.txt')", r"reads files beside itself \(.*line 6: HERE\)"),
+    "a name that is computed": ("np.loadtxt(HERE / f'{len(x)}.txt')", r"reads files beside itself \(.*line 8: HERE\)"),
     "all of a folder": (
         "[*HERE.glob('*.txt')] and x",
-        r"reads files beside itself \(.*line 6: HERE\).*does not say which",
+        r"reads files beside itself \(.*line 8: HERE\).*does not say which",
     ),
     "a file that is not there": ("(HERE / 'gone.txt').exists() or x", r"gone\.txt, which is not there"),
     "a file outside": ("np.loadtxt(HERE.parent.parent / 'out.txt')", r"out\.txt is outside of .*project"),
     "a pickle": ("np.load(HERE / 'model.pkl', allow_pickle=True)", r"model\.pkl is a pickle"),
-    "the current folder": ("np.loadtxt('here.txt')", r"names 'here\.txt', a file in the current folder \(.*line 6\)"),
+    "the current folder": ("np.loadtxt('here.txt')", r"names 'here\.txt', a file in the current folder \(.*line 8\)"),
     "an absolute path": (
         "np.loadtxt(ABSOLUTE)",
-        r"names '/.*/project/lib/a\.txt' \(.*line 6\), which a service has not",
+        r"names '/.*/project/lib/a\.txt' \(.*line 8\), which a service has not",
     ),
+    "a path in a loop": ("[np.loadtxt(q / 'a.txt') for q in [HERE]] and x", r"line 8: HERE\).*does not say which"),
+    "an attribute": ("C.ROOT and x", r"line 5: HERE\).*does not say which"),
     "a package by name": (
         "files('lib').joinpath('a.txt') and x",
-        r"files\('lib'\) \(.*line 6\), which .*Write files\(__package__\)",
+        r"files\('lib'\) \(.*line 8\), which .*Write files\(__package__\)",
     ),
 }
 
@@ -301,7 +303,8 @@ READS = {
 @pytest.mark.parametrize("case", READS)
 def test_other_files_are_refused_by_name(case, project, tmp_path, monkeypatch):
     source, words = READS[case]
-    head = "from importlib.resources import files\nfrom pathlib import Path\nimport numpy as np\nHERE = Path(__file__).parent; "
+    head = "from importlib.resources import files\nfrom pathlib import Path\nimport numpy as np\nHERE = Path(__file__).parent\n"
+    head += "class C: ROOT = HERE\n" if case == "an attribute" else "K = 1\n"
     head += f"UNREAD = ABSOLUTE = {str(project.folder / 'lib' / 'a.txt')!r}\n"
     project.write(lib__init="", lib__data=f"{head}def f(x):\n    return {source} if x.any() else x\n")
     for name in ("../out.txt", "lib/2.txt", "lib/model.pkl", "here.txt", "lib/a.txt"):
@@ -406,7 +409,7 @@ def test_modules_that_are_no_plain_files_are_refused(project, tmp_path, monkeypa
     assert re.search(
         r"Module 'statistics' \(.*project/statistics\.py\) has the name of a module of Python.*Rename it", reasons
     )
-    assert re.search(r"Module 'compiled' is no file of Python text .*Install its package", reasons)
+    assert re.search(r"Module 'compiled' is no file of Python text .*install its package", reasons)
 
 
 @SLOW
