@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import queue
 import re
 import sys
 import textwrap
@@ -13,8 +14,13 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify
 from epypes.bundle.requirements import read_pins
-from epypes.errors import BundleChanged, PromotionRefused, ReplayDiffers, StateChanged
+from epypes.errors import BundleChanged, PromotionRefused, RemoteFailure, ReplayDiffers, StateChanged
+from epypes.service.failures.record import FailedEvent
+from epypes.service.failures.reproduce import reproduce
+from epypes.service.ops.client import Client
+from epypes.wire import Envelope
 from tests.bundle.hostile import in_notebook
+from tests.service.processes import running
 
 SLOW = pytest.mark.slow  # each proves a bundle in processes of its own
 
@@ -418,7 +424,7 @@ def test_state_of_an_own_module_that_no_line_shows_fails_the_event(project):
     project.write(
         lib__init="",
         lib__memory="SEEN = [[]]\n\ndef note(where, x):\n    getattr(where[0], 'app' + 'end')(x)\n    return x * len(where[0])\n",
-        lib__edges="from . import memory as m\n\ndef f(x):\n    return m.note(m.SEEN, x) if x[0, 0] else x\n",
+        lib__edges="def f(x):\n    from . import memory as m\n    return m.note(m.SEEN, x) if x[0, 0] else x\n",
     )
     path = project.promote("from lib import edges", f="edges.f")
     runner = ep.load(path)
@@ -473,3 +479,59 @@ def test_a_notebook_file_takes_modules_beside_it_and_in_a_folder_that_a_cell_put
     promote_notebook(tmp_path / "book" / "n.ipynb", "runner", tmp_path / "b")
     assert own_files(tmp_path / "b") == {"lib/__init__.py", "lib/edges.py", "tool.py"}
     assert ep.load(tmp_path / "b").run(x=4)["z"] == 20
+
+
+@SLOW
+def test_a_service_runs_own_modules_and_a_failure_in_one_is_named_with_its_line(project):
+    fails = "raise ValueError('too bright')"
+    project.write(
+        lib__init="",
+        lib__edges=f"from . import k\n\ndef f(x):\n    if x.max() > 9:\n        {fails}\n    return x + k.K\n",
+    )
+    project.write(lib__k="K = 2\n")
+    path = project.promote("from lib.edges import f", f="f")
+    with running(path) as process, Client(path, timeout_s=60) as client:
+        assert process.ready.startswith("READY")
+        assert list(client.call({"x": np.arange(3.0)}).tokens["f_made"]) == [2, 3, 4]
+        with pytest.raises(RemoteFailure, match="too bright"):
+            client.call({"x": np.full(3, 10.0)})
+    found = reproduce(FailedEvent(), Envelope("x", {"x": np.full(3, 10.0)}), path)
+    assert found.place == f"in 'f', modules/lib/edges.py, line 5: {fails}"
+
+
+@SLOW
+def test_the_adapters_pipeline_and_enumerations_of_a_bundle_may_stand_in_own_modules(project):
+    project.write(
+        lib__init="",
+        lib__parts="""
+            import enum
+            import epypes as ep
+            from epypes.wire import Envelope
+
+            class Mode(enum.Enum):
+                PLUS = 1
+                MINUS = -1
+
+            class Watched(ep.FullPipeline):
+                def emit(self, event, run):
+                    return super().emit(event, run)
+
+            def f(x, mode):
+                return x * mode.value
+
+            def f_in(event):
+                return {"x": event.parts["raw"]}
+
+            def f_out(view):
+                return Envelope("answer", {"y": view["y"]})
+            """,
+    )
+    parts = importlib.import_module("lib.parts")
+    cg = ep.CompGraph({"f": parts.f}, {"f": (("x", "mode"), "y")})
+    pipe = parts.Watched("p", cg, None, None, parts.f_in, parts.f_out, {"mode": parts.Mode.MINUS})
+    pipe.run(x=np.arange(3.0))
+    path = ep.promote(pipe, project.folder.parent / "b").path
+    answers = queue.Queue()
+    loaded = ep.load_pipeline(path, None, answers)
+    loaded.handle(Envelope("event", {"raw": np.arange(3.0)}))
+    assert list(answers.get(timeout=60).parts["y"]) == [0, -1, -2]
