@@ -31,13 +31,15 @@ from __future__ import annotations
 
 import dis
 import functools
+import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from contextvars import ContextVar
 from typing import Any, Final
 
-from epypes.bundle.private_import import loaded_module, plain_name
+from epypes.bundle.private_import import import_module, plain_name
 from epypes.bundle.references import cells_of, defaults_of, global_names, imported_modules, meanings_of, nested_codes
 from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
@@ -197,7 +199,13 @@ class CodeSnapshot(Snapshot):
         for inner in nested_codes(code):
             self._note_instructions(inner)
         yield from meanings_of(function, global_names(code)).items()
-        yield from ((name, loaded_module(name)) for name in imported_modules(function))
+        for name in imported_modules(function):
+            # A module of the bundle is imported now: what it holds when a call imports it could not be put back.
+            module = sys.modules.get(name)
+            if plain_name(name) != name:
+                with suppress(Exception):  # the function raises the same when it is called
+                    module = import_module(name)
+            yield plain_name(name), module
         for name, cell in cells_of(function).items():
             cell.cell_contents = _checked(cell.cell_contents)
             self._compare(_BINDS, functools.partial(Record, name, cell, _read_cell, _write_cell))
