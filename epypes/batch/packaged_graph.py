@@ -25,7 +25,7 @@ from epypes.batch.results import Outcome
 from epypes.bundle import promote
 from epypes.bundle.clone import clone_runner
 from epypes.bundle.load import Bundle, read_bundle
-from epypes.bundle.manifest import REQUIREMENTS, SAMPLES
+from epypes.bundle.manifest import MANIFEST, REQUIREMENTS, SAMPLES, bundle_files
 from epypes.bundle.settings import Unwritable, decode_value, encode_value, members_in
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
@@ -94,8 +94,8 @@ def package_of(runner: CompGraphRunner, item: Item) -> PackagedGraph | None:
         except BundleError as error:
             error.add_note(_NOTE)
             raise
-        paths = sorted(file for file in bundle.path.rglob("*") if file.is_file() and SAMPLES not in file.parts)
-        files = {str(file.relative_to(bundle.path)): file.read_bytes() for file in paths}
+        names = (name for name in (*bundle_files(bundle.path), MANIFEST) if not name.startswith(f"{SAMPLES}/"))
+        files = {name: (bundle.path / name).read_bytes() for name in names}
     package = PackagedGraph(bundle.digest, files)
     if key is not None:
         _PACKAGES[key] = package
@@ -127,8 +127,10 @@ def _key_of(runner: CompGraphRunner) -> tuple[str, ...] | None:
     Values of hyperparameters are not in it: they travel beside the package.
     """
     found = graph_fingerprint(runner.cg)
+    # A file that a function reads beside its module may be another one by now.
+    is_known = not found.unknown and not found.reader
     types = (f"{token} {type(value)}" for token, value in runner.hyperparameters.items())
-    return None if found.unknown else (found.code, found.state, *runner.free_source_tokens, *types)
+    return None if not is_known else (found.code, found.state, *runner.free_source_tokens, *types)
 
 
 # -- serialization --------------------------------------------------------------------------------------------------
@@ -247,8 +249,10 @@ class PackagedJob:
         return self.id
 
 
-# By package and options: the members of the bundle's enumerations, and a runner that each job branches from.
-_LOADED: Final[dict[tuple[str, tuple[tuple[str, Any], ...]], tuple[Mapping[str, Any], CompGraphRunner]]] = {}
+_Folder = tempfile.TemporaryDirectory[str]
+# By package and options: the members of the bundle's enumerations, a runner that each job branches from, and the folder
+# of the bundle, whose functions may read files there.
+_LOADED: Final[dict[tuple[str, tuple[tuple[str, Any], ...]], tuple[Mapping[str, Any], CompGraphRunner, _Folder]]] = {}
 _LOAD_LOCK: Final = threading.Lock()
 
 
@@ -266,14 +270,15 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
         if key not in _LOADED:
             if packaged.package.files is None:
                 return None
+            folder = tempfile.TemporaryDirectory(prefix="epypes-package-")
             try:
-                bundle = _unpacked(packaged.package.files)
+                bundle = _unpacked(packaged.package.files, Path(folder.name))
                 values = unpacked_values(packaged.hyperparameters, bundle.enums)
-                _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options))
+                _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options)), folder
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
                 return _load_error(packaged.package.files, error)
             _drop_oldest(_LOADED, _MOST_LOADED)
-        enums, runner = _LOADED[key]
+        enums, runner, _ = _LOADED[key]
     own = branched(runner)
     own.set(**unpacked_values(packaged.hyperparameters, enums))
     try:
@@ -286,14 +291,13 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
         return str(error)
 
 
-def _unpacked(files: Mapping[str, bytes]) -> Bundle:
-    with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
-        for name, content in files.items():
-            file = Path(folder) / "graph" / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(content)
-        # Its digest has come with it, and what was left out is in its manifest.
-        return read_bundle(Path(folder) / "graph", compare=False)
+def _unpacked(files: Mapping[str, bytes], folder: Path) -> Bundle:
+    for name, content in files.items():
+        file = folder / _NAME / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content)
+    # Its digest has come with it, and what was left out is in its manifest.
+    return read_bundle(folder / _NAME, compare=False)
 
 
 def _load_error(files: Mapping[str, bytes], error: BaseException) -> str:

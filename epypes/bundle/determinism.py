@@ -25,7 +25,7 @@ from epypes.bundle.adapters import ANSWER
 from epypes.bundle.compare import Difference, add_tolerances
 from epypes.bundle.file_access import named_here
 from epypes.bundle.libraries import WARNINGS, attributes_of, changed_attributes, is_of_texts, library_settings
-from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, write_manifest
+from epypes.bundle.manifest import REQUIREMENTS, SAMPLES, SETTINGS, code_of, write_manifest
 from epypes.bundle.replay import ReplayReport
 from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated, without_python
 from epypes.bundle.settings import read_settings
@@ -83,13 +83,13 @@ UNKNOWN: Final = Condition(
 )
 
 
-def other_conditions(module: Path) -> tuple[Condition, ...]:
+def other_conditions(bundle: Path) -> tuple[Condition, ...]:
     """Return the conditions that a second process has otherwise than this one and its children.
 
-    Variables of the environment that a module names as texts are not there, or "1" if they are not here. The others
-    are as they are here: libraries need them.
+    Variables of the environment that a bundle's code names as texts are not there, or "1" if they are not here. The
+    others are as they are here: libraries need them.
     """
-    texts = (node.value for node in ast.walk(ast.parse(module.read_bytes())) if isinstance(node, ast.Constant))
+    texts = (node.value for node in ast.walk(ast.parse(code_of(bundle))) if isinstance(node, ast.Constant))
     named = {text for text in texts if isinstance(text, str) and _VARIABLE.fullmatch(text)}
     usual = str(len(os.sched_getaffinity(0)))
     return (
@@ -158,7 +158,7 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
     PromotionRefused
         The draft fails, or computes something else. The token and what changes it are named.
     """
-    conditions = other_conditions(draft / MODULE)
+    conditions = other_conditions(draft)
     with tempfile.TemporaryDirectory(prefix="epypes-proof-") as scratch, ThreadPoolExecutor(_PROCESSES) as pool:
         replays = partial(pool.map, partial(_replayed, draft, target, Path(scratch), timeout_s))
         usual, other = replays([(), conditions])
@@ -173,10 +173,10 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         refused |= {
             entry.token for entry in found if not entry.is_noise and (entry.token, entry.function) != (ANSWER, "f_out")
         }
-        settings = _changed_settings(usual, draft / MODULE)
+        settings = _changed_settings(usual, draft)
         notes = [reason for name, reason in settings.items() if is_of_texts(name)]
         reasons = [reason for name, reason in settings.items() if not is_of_texts(name)]
-        reasons += [*_changed_libraries(usual, other, draft / MODULE), *usual.changes]
+        reasons += [*_changed_libraries(usual, other, draft), *usual.changes]
         if refused or usual.outside or not usual.tokens:
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
@@ -203,9 +203,9 @@ def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, change
         return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
 
 
-def _changed_settings(usual: ReplayReport, module: Path) -> dict[str, str]:
+def _changed_settings(usual: ReplayReport, bundle: Path) -> dict[str, str]:
     """Return by name what this process has set in libraries that is set otherwise in a fresh one, as sentences."""
-    here, nodes = library_settings(), [*ast.walk(ast.parse(module.read_bytes()))]
+    here, nodes = library_settings(), [*ast.walk(ast.parse(code_of(bundle)))]
     catches = any(isinstance(node, ast.ExceptHandler) or getattr(node, "attr", "") == "suppress" for node in nodes)
     found: dict[str, str] = {}
     for name, default in usual.library_settings.items():
@@ -220,7 +220,7 @@ def _changed_settings(usual: ReplayReport, module: Path) -> dict[str, str]:
     return found
 
 
-def _changed_libraries(usual: ReplayReport, other: ReplayReport, module: Path) -> list[str]:
+def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path) -> list[str]:
     """Return what this process has changed in the libraries of a bundle, as sentences."""
     # What two fresh processes have otherwise depends on the process, and is no change.
     fresh = {
@@ -228,7 +228,7 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, module: Path) -
         for library, described in usual.libraries.items()
         if (others := other.libraries.get(library, described)) is not None
     }
-    changed = changed_attributes(attributes_of(fresh), fresh, module.read_text(encoding="utf-8"))
+    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle))
     # One change is found wherever a library has the object; the shortest of these names is the best known.
     distinct: dict[tuple[str, str, str], str] = {}
     for (library, name), both in sorted(changed.items(), key=lambda item: len(item[0][0])):

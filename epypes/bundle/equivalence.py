@@ -23,15 +23,25 @@ import types
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Final
 
 from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import is_set_by_runs
 from epypes.bundle.expressions import is_data
-from epypes.bundle.load import execute
-from epypes.bundle.manifest import MODULE
-from epypes.bundle.objects import ANNOTATION, ATOMS, CODE, describe, without_nodes
+from epypes.bundle.manifest import MODULE, OWN_MODULES
+from epypes.bundle.objects import (
+    ANNOTATION,
+    ATOMS,
+    CODE,
+    describe,
+    is_installed,
+    is_of_library,
+    module_reads,
+    without_nodes,
+)
+from epypes.bundle.own_modules import OwnModules
+from epypes.bundle.private_import import PrivateImport, plain_name
 from epypes.bundle.references import meanings_of, nested_codes
 from epypes.bundle.resolve import (
     annotated_names,
@@ -47,7 +57,8 @@ from epypes.run import CompGraphRunner
 
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
-    "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token."
+    "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token. "
+    "After a change of a module's file, restart the kernel first."
 )
 
 
@@ -82,7 +93,7 @@ Pair = tuple[str, Any, Any]
 _Definition = ast.FunctionDef | ast.Lambda
 
 
-def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], arrays: ArrayFiles | None = None) -> str:
+def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], *files: ArrayFiles | OwnModules) -> str:
     """Execute a module that was emitted, and return why its objects are not the notebook's; "" if they are.
 
     Parameters
@@ -91,30 +102,31 @@ def refusal(text: str, pairs: Callable[[Any], Iterable[Pair]], arrays: ArrayFile
         The module.
     pairs
         Returns of the module what is compared: how a reason calls an object, the notebook's object and the module's.
-    arrays
-        What it reads from files.
+    files
+        What it reads and imports from the bundle.
     """
     with tempfile.TemporaryDirectory(prefix=_DRAFT) as folder:
         path = Path(folder) / MODULE
         path.write_text(text, encoding="utf-8")
-        if arrays is not None:
-            arrays.write(path.parent)
+        for each in files:
+            each.write(path.parent)
         try:
             return _refusal(path, pairs)
         finally:
-            linecache.cache.pop(str(path), None)
+            for file in [file for file in linecache.cache if file.startswith(folder)]:
+                del linecache.cache[file]
 
 
 def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]]) -> str:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the notebook has shown them
-            module = execute(path, path.read_bytes())
+            module = PrivateImport(path.parent).execute(path)
     except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         where = f", at {str(frames[0].line)!r}" if frames else ""
         return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}"
-    walk = _Walk()
+    walk = _Walk(path.parent / OWN_MODULES)
     walk.waiting.extend((_Path(what, _placed(what, ours)), ours, theirs) for what, ours, theirs in pairs(module))
     try:
         walk.finish()
@@ -124,9 +136,16 @@ def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]]) -> str:
 
 
 class _Walk:
-    """A walk over two graphs of objects that compares each pair of objects once."""
+    """A walk over two graphs of objects that compares each pair of objects once.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    modules
+        The folder of the modules that the draft has taken along.
+    """
+
+    def __init__(self, modules: Path) -> None:
+        self._modules = modules
         self.waiting: deque[tuple[_Path, Any, Any]] = deque()
         # The objects by their ids. They are kept here, so that no id is used again.
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
@@ -139,6 +158,8 @@ class _Walk:
         while self.waiting:
             path, ours, theirs = self.waiting.popleft()
             ours, theirs = without_nodes(ours), without_nodes(theirs)
+            if isinstance(theirs, str | PurePath) and type(ours) is type(theirs) and self._is_moved(ours, theirs):
+                continue
             self._compare_identity(path, ours, theirs)
             if ours is not theirs and (id(ours), id(theirs)) not in self._seen:
                 self._seen[id(ours), id(theirs)] = ours, theirs
@@ -146,6 +167,15 @@ class _Walk:
         for has_equals, difference in self._divided.items():
             if self._asks_for_identity or (self._asks_for_membership and not has_equals):
                 raise difference
+
+    def _is_moved(self, ours: Any, theirs: Any) -> bool:
+        """Whether these are the name, or the path, of one module or of a file beside it, here and in the draft."""
+        if isinstance(theirs, str) and plain_name(theirs) != theirs:
+            return plain_name(theirs) == plain_name(ours)
+        if not PurePath(theirs).is_relative_to(self._modules):
+            return False
+        parts = PurePath(theirs).relative_to(self._modules).parts
+        return PurePath(ours).is_absolute() and (not parts or PurePath(ours).parts[-len(parts) :] == parts)
 
     def _compare_identity(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Note an object of one side that is several objects of the other."""
@@ -164,7 +194,8 @@ class _Walk:
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
         try:
-            if isinstance(ours, types.ModuleType | CompGraphRunner):
+            is_installed_module = isinstance(ours, types.ModuleType) and is_installed(ours.__name__)
+            if is_installed_module or isinstance(ours, CompGraphRunner):
                 raise TypeError("what a module holds, and a runner's last run, is no part of its description")
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
@@ -188,6 +219,11 @@ class _Walk:
             names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
+        if isinstance(ours, types.FunctionType) and not is_of_library(ours):
+            read, others_read = ({f" {name!r}": part for name, part in module_reads(one)} for one in (ours, theirs))
+            # Of a package, the notebook may have modules that no code of the bundle imports.
+            extra = {name for name in read.keys() - others_read if isinstance(read[name], types.ModuleType)}
+            self._add_all(path, {name: part for name, part in read.items() if name not in extra}, others_read)
 
     def _add_all(self, path: _Path, mine: Mapping[str, Any], others: Mapping[str, Any]) -> None:
         """Add parts by name, which must be the same in the same order."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from epypes.bundle.manifest import MODULE
 
-_SYSTEM: Final = (
+ON_EVERY_MACHINE: Final = (
     *("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr"),
     *("/System", "/Library", "/var/cache", "/var/lib"),
 )
@@ -89,7 +89,7 @@ class FileAccess:
         home = Path("~").expanduser()
         packages = (module for name, module in [*sys.modules.items()] if "." not in name)
         folders = [
-            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, *_SYSTEM),
+            *(self._folder, os.getcwd(), sys.prefix, sys.base_prefix, *ON_EVERY_MACHINE),
             *(folder for module in packages for folder in getattr(module, "__path__", ())),
             *(os.environ.get("XDG_CACHE_HOME", home / ".cache"), os.environ.get("XDG_CONFIG_HOME", home / ".config")),
         ]
@@ -111,8 +111,9 @@ class FileAccess:
         frame: FrameType | None = sys._getframe(2)
         while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
             file, name = Path(frame.f_code.co_filename), frame.f_code.co_name
-            if file.parent == self._folder:
-                return f"{'The module' if name == '<module>' else f'{name}()'} ({file.name}, line {frame.f_lineno})"
+            if file.is_relative_to(self._folder):
+                where = f"{file.relative_to(self._folder).as_posix()}, line {frame.f_lineno}"
+                return f"{'The module' if name == '<module>' else f'{name}()'} ({where})"
             frame = frame.f_back
         return ""
 

@@ -13,13 +13,10 @@ each, and then equal digests are no proof that nothing has changed.
 from __future__ import annotations
 
 import hashlib
-import importlib
-import importlib.util
 import re
 import sys
 import types
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from importlib import metadata
 from pathlib import Path, PurePath
 from typing import Any, Final
@@ -33,8 +30,11 @@ from epypes.bundle.objects import (
     describe_message,
     is_installed,
     is_of_library,
+    module_reads,
+    will_be_installed,
     without_nodes,
 )
+from epypes.bundle.private_import import plain_name
 from epypes.bundle.references import imported_modules, nested_codes
 from epypes.bundle.requirements import bringing
 
@@ -42,15 +42,12 @@ _DIGEST_BYTES: Final = 16
 _OURS: Final = "epypes"
 # Builtins by which code reads what its names don't say.
 _BY_TEXT: Final = frozenset({"eval", "exec", "globals", "__import__"})
-_ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
 # Names by which code reads files or the environment: of Python, numpy, OpenCV, Pillow, pandas and scikit-image.
 _READERS: Final = frozenset({
     "VideoCapture", "environ", "environb", "fromfile", "genfromtxt", "getenv", "getenvb", "imread", "imreadmulti",
     "load", "loadtxt", "memmap", "open", "open_memmap", "read_bytes", "read_csv", "read_parquet", "read_text",
     "urlopen",
 })  # fmt: skip
-# The folders that pip, and Debian's packages, install into.
-_INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset(
     {"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "pathlib", "uuid"}
@@ -205,28 +202,10 @@ class Digester:
         by_text = min(_BY_TEXT.intersection(dict(waiting)) - function.__globals__.keys(), default="")
         if by_text or "import_module" in used:
             self._add_unknown(function, f"a call of {by_text or 'import_module'!r}")
-        found: list[tuple[str, Any]] = []
-        for name in imported_modules(function):
-            with suppress(Exception):  # the function raises the same when it is called
-                if _will_be_installed(name.partition(".")[0]):
-                    self._met.add(name)
-                else:
-                    found.append((name, importlib.import_module(name)))
+        self._met.update(filter(will_be_installed, imported_modules(function)))
+        found = module_reads(function)
         waiting += found
-        own_functions, seen = set[str](), set[str]()
-        while waiting:
-            name, value = waiting.pop()
-            if isinstance(value, types.FunctionType):
-                own_functions.add(name.rpartition(".")[2])
-            elif (
-                isinstance(value, types.ModuleType) and value.__name__ not in seen and not is_installed(value.__name__)
-            ):
-                seen.add(value.__name__)
-                own = {one: part for one, part in vars(value).items() if not one.startswith("__")}
-                read = own.keys() if _ATTRIBUTES_BY_TEXT & used else used & own.keys()
-                new = [(f"{name}.{one}", own[one]) for one in sorted(read)]
-                found += new
-                waiting += new
+        own_functions = {name.rpartition(".")[2] for name, value in waiting if isinstance(value, types.FunctionType)}
         self.reader = self.reader or min(_READERS & used - own_functions, default="")
         return found
 
@@ -238,6 +217,8 @@ def versions_of(modules: Iterable[str]) -> list[str]:
     """Return a line for each of these modules: the versions of its distributions, or the digest of its own file."""
     found = {"python": sys.version}
     for name in modules:
+        if plain_name(name) != name:
+            continue  # a bundle's own module, whose number is another one in each process
         top, file = name.partition(".")[0], getattr(sys.modules.get(name), "__file__", None)
         if top == _OURS:
             found[top] = metadata.version(_OURS)
@@ -246,11 +227,3 @@ def versions_of(modules: Iterable[str]) -> list[str]:
         elif file:
             found[name] = file_digest(Path(file))
     return sorted(f"{name} {version}" for name, version in found.items())
-
-
-def _will_be_installed(top: str) -> bool:
-    """Whether a module, which is not imported for it, is of an installed package."""
-    if top in sys.modules:
-        return is_installed(top)
-    spec = importlib.util.find_spec(top)
-    return spec is not None and not _INSTALLED.isdisjoint(Path(spec.origin or "").parts)

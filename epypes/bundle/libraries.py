@@ -146,11 +146,16 @@ def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes
     return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages and not is_own(name))
 
 
-def load_named(text: str) -> None:
-    """Load what a bundle's module names of libraries that load their parts when these are first asked for."""
+def load_named(text: str, own: Collection[str] = ()) -> None:
+    """Load what a bundle names of libraries that load their parts when these are first asked for; none of its own."""
     nodes, names = [*ast.walk(ast.parse(text))], {**sys.modules}
     for node in nodes:
-        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+        if not isinstance(node, ast.Import | ast.ImportFrom):
+            continue
+        for alias in node.names:
+            home = alias.name if isinstance(node, ast.Import) else "." * node.level + (node.module or "")
+            if home.partition(".")[0] in {"", *own}:
+                continue
             with suppress(Exception):  # whatever a module raises that no sample has imported
                 if isinstance(node, ast.ImportFrom):
                     source = importlib.import_module(node.module or "")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-import threading
 import traceback
-import types
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,8 +10,17 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, own_part, payload_of
 from epypes.bundle.arrays import StoredArray, read_array
-from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, bundle_files, check_manifest
+from epypes.bundle.manifest import (
+    MODULE,
+    OWN_MODULES,
+    REQUIREMENTS,
+    SAMPLES,
+    SETTINGS,
+    bundle_files,
+    check_manifest,
+)
 from epypes.bundle.mutable_state import MutableState
+from epypes.bundle.private_import import PrivateImport
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -23,8 +29,10 @@ from epypes.run import CompGraphRunner
 from epypes.run.guard import called_for
 
 MAKER: Final = "make_pipeline"
-# Two bundles of one name must not take each other's place among the modules.
-_EXECUTING: Final = threading.RLock()
+MODULES_OF_A_BUNDLE: Final = (
+    "A bundle imports installed packages, and the modules of the project that its code named when it was promoted: "
+    f"install what its {REQUIREMENTS} lists, or import the module by name and promote it again"
+)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -90,7 +98,7 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
             if MODULE not in files:
                 raise BundleError(folder, f"{folder} has no {MODULE}. Promote the graph again.")
             for file in files:
-                if file.endswith(".npy"):
+                if file.endswith(".npy") and not file.startswith(f"{OWN_MODULES}/"):
                     read_array(folder / file, "r")
             module = _imported(folder)
             enums = getattr(module, "enums", {})
@@ -124,13 +132,14 @@ def _imported(folder: Path) -> Any:
     """Execute a bundle's module; what it can't import is named with the way out."""
     path = folder / MODULE
     try:
-        return execute(path, path.read_bytes())
+        return PrivateImport(folder).execute(path)
     except ImportError as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        frames = [
+            frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(folder))
+        ]
+        path = Path(frames[-1].filename) if frames else path
         where = f" at line {frames[-1].lineno}, {frames[-1].line!r}" if frames else ""
-        text = f"{path} can't be imported{where}: {type(error).__name__}: {error}"
-        way_out = "Only installed packages can be imported in a bundle: install what its"
-        text = f"{text}. {way_out} {REQUIREMENTS} lists, or move the code into the notebook and promote it again."
+        text = f"{path} can't be imported{where}: {type(error).__name__}: {error}. {MODULES_OF_A_BUNDLE}."
         raise BundleError(folder, text) from error
 
 
@@ -149,24 +158,6 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_ino, found.st_ctime_ns
-
-
-def execute(path: Path, source: bytes) -> Any:
-    """Execute the module's source as it was checked; a cached .pyc, which the manifest does not cover, is not read."""
-    module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
-    module.__file__ = str(path)
-    # While their module runs, dataclasses look for it there.
-    with _EXECUTING:
-        before = sys.modules.get(module.__name__)
-        sys.modules[module.__name__] = module
-        try:
-            exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)  # noqa: S102 - its purpose
-        finally:
-            if before is None:
-                del sys.modules[module.__name__]
-            else:
-                sys.modules[module.__name__] = before
-    return module
 
 
 def load(path: str | Path) -> CompGraphRunner:

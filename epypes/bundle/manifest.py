@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import hashlib
+import importlib.util
 import os
 import platform
 import stat
@@ -28,6 +29,8 @@ from epypes.errors import BundleChanged, BundleError
 MODULE: Final = "pipeline.py"
 SETTINGS: Final = "pipeline.toml"
 SAMPLES: Final = "samples"
+# The folder of the modules of the user's project.
+OWN_MODULES: Final = "modules"
 REQUIREMENTS: Final = "requirements.txt"
 MANIFEST: Final = "MANIFEST.sha256"
 _TEXTS: Final = (MODULE, SETTINGS, REQUIREMENTS)
@@ -52,7 +55,7 @@ def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -
     """
     names = bundle_files(folder)
     facts = dict(recorded_environment(folder) if environment is None else environment)
-    facts |= {f"{_LINES}{name}": _sums(folder / name) for name in names if name in _TEXTS}
+    facts |= {f"{_LINES}{name}": _sums(folder / name) for name in names if _is_text(name)}
     lines = [f"{_FACT}{name}: {value}\n" for name, value in facts.items()]
     lines += [f"{_hash(folder / name)}  {name}\n" for name in names]
     (folder / MANIFEST).write_text("".join(lines), encoding="utf-8")
@@ -174,7 +177,7 @@ def bundle_files(folder: Path) -> list[str]:
             continue
         if not stat.S_ISREG(status.st_mode):
             raise BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
-        if name.as_posix() in (*_TEXTS, MANIFEST) and status.st_size > _MOST_TEXT_MB * 1024**2:
+        if (_is_text(name.as_posix()) or name.as_posix() == MANIFEST) and status.st_size > _MOST_TEXT_MB * 1024**2:
             text = f"{path} is larger than {_MOST_TEXT_MB} MB, which no text of a bundle is. Promote again."
             raise BundleError(folder, text)
         total_bytes += status.st_size
@@ -184,6 +187,30 @@ def bundle_files(folder: Path) -> list[str]:
         if name.as_posix() != MANIFEST and not (name.parent.name == "__pycache__" and ".pyc" in name.suffixes):
             found.append(name)
     return [name.as_posix() for name in sorted(found)]
+
+
+def _is_text(name: str) -> bool:
+    return name in _TEXTS or is_module(name)
+
+
+def is_module(name: str) -> bool:
+    """Whether a file of a bundle, by its name there, is Python code."""
+    return name == MODULE or (name.startswith(f"{OWN_MODULES}/") and name.endswith(".py"))
+
+
+def module_files(folder: Path) -> list[Path]:
+    """Return the files of a bundle that are Python code: ``pipeline.py`` and the modules of the user's project."""
+    return [folder / MODULE, *sorted((folder / OWN_MODULES).rglob("*.py"))]
+
+
+def code_of(folder: Path) -> str:
+    """Return the text of all Python code of a bundle, one file after another, to look for names and imports in it."""
+    return "\n".join(importlib.util.decode_source(file.read_bytes()) for file in module_files(folder))
+
+
+def own_packages(folder: Path) -> frozenset[str]:
+    """Return the outermost packages and modules of the user's project that a bundle has."""
+    return frozenset(path.name.removesuffix(".py") for path in (folder / OWN_MODULES).glob("*"))
 
 
 def _hash(path: Path) -> str:

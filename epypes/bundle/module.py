@@ -20,6 +20,7 @@ from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.objects import without_nodes
+from epypes.bundle.own_modules import OwnModules
 from epypes.bundle.resolve import Position, Refused, parsed
 from epypes.bundle.settings import Settings, members_in
 from epypes.bundle.slice import Slice, gather
@@ -53,8 +54,8 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 
 def write_module(
     cg: CompGraph, settings: Settings, adapters: Mapping[str, Callable[..., Any]], pipeline: Pipeline | None
-) -> tuple[str, ArrayFiles, list[str]]:
-    """Return the text of ``pipeline.py``, the arrays that it reads from files, and the reasons against it.
+) -> tuple[str, Sequence[ArrayFiles | OwnModules], list[str]]:
+    """Return the text of ``pipeline.py``, what it reads and imports from the bundle, and the reasons against it.
 
     Parameters
     ----------
@@ -98,11 +99,13 @@ def write_module(
 
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
     gathered, references = gather(write, reserved, stores_arrays=True)
-    if gathered.refusals:
-        return "", gathered.arrays, list(dict.fromkeys(gathered.refusals))
+    modules = OwnModules(sorted(gathered.modules))
+    modules.check([*cg.functions.values(), *adapters.values(), *enums.values(), pipeline], gathered.patches)
+    if gathered.refusals or modules.refusals:
+        return "", (), list(dict.fromkeys([*gathered.refusals, *modules.refusals]))
     module = emit_module(settings, cg, gathered, references)
-    why = refusal(module, functools.partial(_pairs, cg, adapters, pipeline, enums), gathered.arrays)
-    return module, gathered.arrays, [why] if why else []
+    why = refusal(module, functools.partial(_pairs, cg, adapters, pipeline, enums), gathered.arrays, modules)
+    return module, (gathered.arrays, modules), [why] if why else []
 
 
 def _pairs(

@@ -35,9 +35,11 @@ import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from contextvars import ContextVar
 from typing import Any, Final
 
+from epypes.bundle.private_import import import_module, plain_name
 from epypes.bundle.references import cells_of, defaults_of, global_names, imported_modules, meanings_of, nested_codes
 from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
@@ -197,7 +199,13 @@ class CodeSnapshot(Snapshot):
         for inner in nested_codes(code):
             self._note_instructions(inner)
         yield from meanings_of(function, global_names(code)).items()
-        yield from ((name, sys.modules.get(name)) for name in imported_modules(function))
+        for name in imported_modules(function):
+            # A module of the bundle is imported now: what it holds when a call imports it could not be put back.
+            module = sys.modules.get(name)
+            if plain_name(name) != name:
+                with suppress(Exception):  # the function raises the same when it is called
+                    module = import_module(name)
+            yield plain_name(name), module
         for name, cell in cells_of(function).items():
             cell.cell_contents = _checked(cell.cell_contents)
             self._compare(_BINDS, functools.partial(Record, name, cell, _read_cell, _write_cell))
@@ -222,7 +230,7 @@ class CodeSnapshot(Snapshot):
 
     def _look_at_module(self, module: types.ModuleType) -> Found:
         if is_own(module.__name__):
-            yield from self._look_at_names(f"{module.__name__}.", vars(module))
+            yield from self._look_at_names(f"{plain_name(module.__name__)}.", vars(module))
 
     def _look_at_names(self, prefix: str, owner: Any) -> Found:
         _check_caches(owner)

@@ -14,6 +14,7 @@ import copyreg
 import dataclasses
 import enum
 import functools
+import importlib.util
 import inspect
 import re
 import sys
@@ -23,10 +24,12 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from epypes.bundle.expressions import has_steady_order
-from epypes.bundle.references import defaults_of, global_names, meanings_of, nested_codes
+from epypes.bundle.private_import import import_module, loaded_module, plain_name
+from epypes.bundle.references import defaults_of, global_names, imported_modules, meanings_of, nested_codes
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner
@@ -57,6 +60,10 @@ _OF_ENUMS: Final = frozenset(
 _OF_A_NODE: Final = frozenset({*vars(Node("", len))})
 # The registry of these is described without their cache, which each call may fill.
 _SINGLE_DISPATCH: Final = frozenset(nested_codes(functools.singledispatch.__code__))
+# Builtins by which code reads attributes that its names don't say.
+ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
+# The folders that pip, and Debian's packages, install into.
+INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
 _NUMBERS_AND_TEXTS: Final[tuple[Any, ...]] = (tuple, str, bytes, int, float, complex)
 _CONTENTS: Final[Mapping[type, Callable[[Any], Any]]] = {
     **{kind: kind.__getnewargs__ for kind in _NUMBERS_AND_TEXTS},
@@ -221,7 +228,7 @@ def _cached_function(cached: Any) -> Description:
 
 
 def _module(module: types.ModuleType) -> Description:
-    return Description("module", (module.__name__,), module=module.__name__)
+    return Description("module", (plain_name(module.__name__),), module=module.__name__)
 
 
 def _class(kind: type) -> Description:
@@ -387,6 +394,38 @@ def is_installed(module: str) -> bool:
     return module != "__main__" and not is_own(module.partition(".")[0])
 
 
+def will_be_installed(module: str) -> bool:
+    """Whether a module, which is not imported for it, is of an installed package."""
+    top = module.partition(".")[0]
+    if loaded_module(top):
+        return is_installed(top)
+    spec = importlib.util.find_spec(top)
+    return spec is not None and not INSTALLED.isdisjoint(Path(spec.origin or "").parts)
+
+
+def module_reads(function: types.FunctionType) -> list[tuple[str, Any]]:
+    """Return what a function reads of modules of the user, by name, also of those that it imports when it is called."""
+    codes = [*nested_codes(function.__code__)]
+    used = {name for code in codes for name in code.co_names}
+    found: list[tuple[str, Any]] = []
+    for name in imported_modules(function):
+        with suppress(Exception):  # the function raises the same when it is called
+            if not will_be_installed(name):
+                found.append((plain_name(name), import_module(name)))
+    meanings = meanings_of(function, {*function.__code__.co_freevars, *global_names(function.__code__)})
+    waiting, seen = [*meanings.items(), *found], set[str]()
+    while waiting:
+        name, value = waiting.pop()
+        if isinstance(value, types.ModuleType) and value.__name__ not in seen and not is_installed(value.__name__):
+            seen.add(value.__name__)
+            own = {one: part for one, part in vars(value).items() if not one.startswith("__")}
+            read = own.keys() if ATTRIBUTES_BY_TEXT & used else used & own.keys()
+            new = [(f"{name}.{one}", own[one]) for one in sorted(read)]
+            found += new
+            waiting += new
+    return found
+
+
 def _home(value: Any) -> tuple[str, str] | None:
     """Return the module and the name by which a function or class of an installed package is imported."""
     if not callable(value):
@@ -403,7 +442,7 @@ def _home(value: Any) -> tuple[str, str] | None:
 def _found(module: str, name: str) -> Any:
     first, *rest = name.split(".")
     # Not by getattr, which would run the module's own __getattr__.
-    found: Any = getattr(sys.modules.get(module), "__dict__", {}).get(first)
+    found: Any = getattr(loaded_module(module), "__dict__", {}).get(first)
     for part in rest:
         found = getattr(found, part, None)
     return found

@@ -168,15 +168,15 @@ def _write(
         own=(*adapters, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
     )  # fmt: skip
     reasons = [*_unready(runner, wanted), *unwritable(hyperparameters), *unwritable(attributes, "Attribute")]
-    module, arrays, refusals = write_module(cg, settings, adapters, pipeline)
+    module, files, refusals = write_module(cg, settings, adapters, pipeline)
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
     runs = [*_runs(runner, samples)]
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
-    arrays.write(draft)
-    stored.write(draft)
+    for each in (*files, stored):
+        each.write(draft)
     for number, run in enumerate(runs):
         _record(draft / SAMPLES / f"{number:03}.npz", run, settings, adapters.get("f_out"))
     return settings

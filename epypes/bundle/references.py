@@ -6,13 +6,16 @@ objects, the mutable state, the fingerprints and the static checks all resolve n
 
 from __future__ import annotations
 
+import ast
 import builtins
 import dis
 import importlib.util
 import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Final
+
+from epypes.bundle.private_import import name_meant
 
 # A class reads the name of the module around it, whichever that is, and has its own annotations.
 _OF_EVERY_CLASS: Final = frozenset({"__name__", "__annotations__"})
@@ -46,7 +49,7 @@ def global_names(code: types.CodeType) -> list[str]:
 
 
 def imported_modules(function: types.FunctionType) -> list[str]:
-    """Return the names of all modules that a function may import when it runs, sorted."""
+    """Return the names of all modules that a function may import when it runs, as Python knows them, sorted."""
     package = function.__globals__.get("__package__") or ""
     found: set[str] = set()
     for code in nested_codes(function.__code__):
@@ -56,9 +59,37 @@ def imported_modules(function: types.FunctionType) -> list[str]:
             if step.opname == "IMPORT_NAME":
                 with suppress(ImportError):  # a relative import beyond the package
                     name = importlib.util.resolve_name("." * level.argval + step.argval, package)
+                    name = name if level.argval else name_meant(name, function.__globals__)
                     # A name that is taken from a package may be a module of it.
                     found |= {name, *(f"{name}.{one}" for one in taken.argval or ())}
     return sorted(found)
+
+
+def imports_in(tree: ast.AST, names: Mapping[str, Any]) -> list[str]:
+    """Return the modules that the import statements of a text may name, as Python knows them; ``names`` are its own."""
+    found: dict[str, None] = {}
+    for node in (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)):
+        for alias in node.names:
+            with suppress(ImportError):  # a relative import beyond the package
+                module = module_of_import(node, alias, names)
+                # A name that is taken from a package may be a module of it.
+                found |= {module: None} | ({f"{module}.{alias.name}": None} if isinstance(node, ast.ImportFrom) else {})
+    return [*found]
+
+
+def module_of_import(node: ast.Import | ast.ImportFrom, alias: ast.alias, names: Mapping[str, Any]) -> str:
+    """Return the module that an import statement names; an ImportError is raised where it is beyond the package."""
+    if isinstance(node, ast.Import):
+        return name_meant(alias.name, names)
+    if not node.level:
+        return name_meant(node.module or "", names)
+    return importlib.util.resolve_name("." * node.level + (node.module or ""), names.get("__package__") or "")
+
+
+def is_main_guard(node: ast.stmt) -> bool:
+    """Whether a statement is executed only where its file is run as a program."""
+    test = ast.unparse(node.test).replace('"', "'") if isinstance(node, ast.If) else ""
+    return test in ("__name__ == '__main__'", "'__main__' == __name__")
 
 
 def cells_of(function: types.FunctionType) -> dict[str, types.CellType]:

@@ -26,13 +26,15 @@ from epypes.bundle.compare import Difference, differences
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.fingerprint import Digester
 from epypes.bundle.libraries import changed_attributes, library_attributes, library_settings, load_named
-from epypes.bundle.load import Bundle, read_bundle
+from epypes.bundle.load import MODULES_OF_A_BUNDLE, Bundle, read_bundle
 from epypes.bundle.manifest import (
-    MODULE,
     REQUIREMENTS,
     SAMPLES,
     check_manifest,
+    code_of,
     environment_differences,
+    module_files,
+    own_packages,
     recorded_environment,
 )
 from epypes.bundle.replay import ReplayReport, record_again, replay
@@ -151,17 +153,17 @@ def main(arguments: Sequence[str]) -> int:
 
 def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
     """Replay, and report what was imported, which files were opened, and which lines did not run."""
-    text = (folder / MODULE).read_text(encoding="utf-8")
+    text, own = code_of(folder), own_packages(folder)
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
         with contextlib.suppress(EpypesError):
             sample = load_sample(path)
             list(differences(sample, sample))
     before = frozenset(sys.modules)
-    access, ran = FileAccess(folder), trace_lines(folder / MODULE)
+    access, ran = FileAccess(folder), trace_lines(folder)
     bundle = read_bundle(folder, compare=False)
     access.note_names(bundle.settings.hyperparameters)
-    fingerprints, named = _fingerprints(bundle), imported_names(text)
+    fingerprints, named = _fingerprints(bundle), imported_names(text, own)
     trace = sys.gettrace()
     sys.settrace(None)  # which would make this many times slower
     as_loaded = library_attributes(named, sys.modules.keys() - before) if with_libraries else {}
@@ -170,7 +172,7 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
     sys.settrace(None)
     new = sys.modules.keys() - before
     if with_libraries:
-        load_named(text)
+        load_named(text, own)
     libraries = library_attributes(named, new) if with_libraries else {}
     changed = changed_attributes(libraries, as_loaded, text)
     return replace(
@@ -179,7 +181,7 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
         requirements=requirement_lines(named | new),
         libraries=libraries,
         changes=[f"A function changes {module}.{name} {_OUTLIVES}" for module, name in changed],
-        notes=_unproved_lines(ran),
+        notes=_unproved_lines(ran, folder),
         library_settings=library_settings(),
         fingerprints=fingerprints,
     )
@@ -197,26 +199,27 @@ def _fingerprints(bundle: Bundle) -> dict[str, str]:
 def _describe(error: BaseException, folder: Path) -> str:
     """Describe what failed in the bundle's own code, with its last line there."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(folder))]
-    where = f" at {Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
+    where = (
+        f" at {Path(frames[-1].filename).relative_to(folder).as_posix()}, line {frames[-1].lineno}: {frames[-1].line}"
+        if frames
+        else ""
+    )
     notes = "; ".join(getattr(error, "__notes__", ()))
     text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(str(error).split())}"
     if isinstance(error, ModuleNotFoundError):
-        text += (
-            ". Only installed packages can be imported in a bundle: install what its requirements.txt lists, "
-            "or move the code into the notebook"
-        )
+        text += f". {MODULES_OF_A_BUNDLE}"
     elif isinstance(error, FileNotFoundError) and not os.path.isabs(os.fsdecode(error.filename or os.sep)):
         text += ". A replay runs in another working folder than the notebook"
     return f"{text} ({notes})" if notes else text
 
 
-def trace_lines(path: Path) -> dict[CodeType, set[int]]:
-    """Note from now on which lines of a module's functions run, in this thread and in those that begin later."""
-    ran: dict[CodeType, set[int]] = {}
+def trace_lines(folder: Path) -> dict[CodeType, set[int]]:
+    """Note from now on which lines of a bundle's functions run, in this thread and in those that begin later."""
+    files, ran = frozenset(map(str, module_files(folder))), dict[CodeType, set[int]]()
 
     def on_event(frame: FrameType, event: str, argument: Any) -> Any:
         code = frame.f_code
-        if code.co_filename != str(path) or not code.co_flags & inspect.CO_OPTIMIZED:
+        if code.co_filename not in files or not code.co_flags & inspect.CO_OPTIMIZED:
             return None  # another file, or the body of a module or class
         ran.setdefault(code, {code.co_firstlineno}).add(frame.f_lineno)
         return on_event
@@ -226,18 +229,23 @@ def trace_lines(path: Path) -> dict[CodeType, set[int]]:
     return ran
 
 
-def _unproved_lines(ran: Mapping[CodeType, Collection[int]]) -> list[str]:
-    """Return the lines that were left out of functions that ran, as a sentence, if there are any."""
-    every = {line for code in ran for _, _, line in code.co_lines() if line}
-    missed = sorted(every.difference(*ran.values()))
-    grouped = groupby(enumerate(missed), key=lambda numbered: numbered[1] - numbered[0])
-    spans = [[line for _, line in group] for _, group in grouped]
-    if not spans:
-        return []
-    named = ", ".join(f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans[:_MOST_NAMED])
-    more = " and others" if len(spans) > _MOST_NAMED else ""
-    text = f"No sample runs these lines of {MODULE}, so no replay proves them: {named}{more}."
-    return [f"{text} Give payloads that do: samples=[...]."]
+def _unproved_lines(ran: Mapping[CodeType, Collection[int]], folder: Path) -> list[str]:
+    """Return for each file the lines that were left out of functions that ran, as a sentence, if there are any."""
+    found = []
+    for file in module_files(folder):
+        lines = {code: numbers for code, numbers in ran.items() if code.co_filename == str(file)}
+        missed = sorted({line for code in lines for _, _, line in code.co_lines() if line}.difference(*lines.values()))
+        grouped = groupby(enumerate(missed), key=lambda numbered: numbered[1] - numbered[0])
+        spans = [[line for _, line in group] for _, group in grouped]
+        if spans:
+            named = ", ".join(
+                f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans[:_MOST_NAMED]
+            )
+            more = " and others" if len(spans) > _MOST_NAMED else ""
+            name = file.relative_to(folder).as_posix()
+            text = f"No sample runs these lines of {name}, so no replay proves them: {named}{more}."
+            found.append(f"{text} Give payloads that do: samples=[...].")
+    return found
 
 
 # -- verification ---------------------------------------------------------------------------------------------------

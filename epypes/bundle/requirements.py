@@ -23,6 +23,7 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
 from epypes.bundle.manifest import REQUIREMENTS
+from epypes.bundle.references import is_main_guard
 from epypes.errors import BundleError
 
 INSTALL_TIMEOUT_S: Final = 1200.0
@@ -40,18 +41,21 @@ _ADDRESSES: Final = re.compile(r"https?://\S+")
 # -- which distributions a bundle imports ----------------------------------------------------------------------------
 
 
-def imported_names(text: str) -> frozenset[str]:
-    """Return the modules that the statements of a module import, also in lines that no sample runs.
+def imported_names(text: str, own: Collection[str] = ()) -> frozenset[str]:
+    """Return the modules that the statements of a bundle import, also in lines that no sample runs.
 
-    Names that are imported from a module are among them: they may be modules too.
+    Names that are imported from a module are among them: they may be modules too. Those of the bundle's ``own``
+    packages are not.
     """
     found: set[str] = set()
-    for node in ast.walk(ast.parse(text)):
+    tree = ast.parse(text)
+    tree.body = [node for node in tree.body if not is_main_guard(node)]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    return frozenset(found)
+    return frozenset(name for name in found if name.partition(".")[0] not in own)
 
 
 def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:

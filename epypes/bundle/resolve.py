@@ -26,6 +26,7 @@ from functools import lru_cache
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, Final, TypeGuard
 
+from epypes.bundle.private_import import loaded_module
 from epypes.bundle.references import captured_by, global_names, namespace_of, nested_codes
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -97,7 +98,7 @@ def _modules_with(name: str, own: str) -> Iterator[str]:
 
 
 def _reached(module: str, qualname: str) -> Any:
-    found: Any = sys.modules.get(module)
+    found: Any = loaded_module(module)
     for part in qualname.split("."):
         found = getattr(found, part, None)
     return found

@@ -12,11 +12,12 @@ import inspect
 import sys
 import types
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
-from epypes.bundle.references import global_names, namespace_of
+from epypes.bundle.private_import import loaded_module
+from epypes.bundle.references import global_names, module_of_import, namespace_of
 from epypes.bundle.resolve import (
     Definition,
     Refused,
@@ -164,7 +165,7 @@ def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
 
 def check_reads(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads by reflection, or what the notebook has changed in a library's module or class."""
-    names = {**sys.modules, **found.names, **_imported_by(found)}
+    names = {**sys.modules, **found.names, **imported_by(found)}
     _check_reflection(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
@@ -175,7 +176,8 @@ def check_reads(found: Definition, known: Patches) -> None:
             if owner is not None:
                 raise _patched(found.what, f"{owner.__name__}.{name}", place)
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
-    for owner, name in _read_by(found.node, names):
+    home = loaded_module(str(found.names.get("__name__")))
+    for owner, name in (*_read_by(found.node, names), *((home, name) for name in found.reads())):
         if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
             owner, name = of_classes.get(name, (None, name))
         place = _place_of_patch(known, owner, name, found.place_in(found.node))
@@ -186,7 +188,7 @@ def check_reads(found: Definition, known: Patches) -> None:
 def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
     """Refuse an object that can be imported only as the notebook has changed it."""
     name = qualname.partition(".")[0]
-    place = _place_of_patch(known, sys.modules[module], name, "by a name that no text has")
+    place = _place_of_patch(known, loaded_module(module), name, "by a name that no text has")
     if place:
         raise _patched(what, f"{module}.{qualname}", place)
 
@@ -196,16 +198,21 @@ def _patched(what: str, name: str, place: str) -> Refused:
     return Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
 
 
-def _imported_by(found: Definition) -> dict[str, Any]:
+def imported_by(found: Definition) -> dict[str, Any]:
     """Return what a definition imports itself, by name; refuse the notebook as a module."""
     names: dict[str, Any] = {}
-    for node in ast.walk(found.node):
-        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
-            source = getattr(node, "module", None) or alias.name
+    for node in (node for node in ast.walk(found.node) if isinstance(node, ast.Import | ast.ImportFrom)):
+        for alias in node.names:
+            try:
+                source = module_of_import(node, alias, found.names)
+            except ImportError:  # the function raises the same when it is called
+                continue
             if "__main__" in (source, alias.name):
                 text = f"{found.what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
                 raise Refused(f"{text}. Use what it has by its own name, without the module.")
-            names[alias.asname or alias.name] = getattr(sys.modules.get(source), alias.name, sys.modules.get(source))
+            module = loaded_module(source)
+            part = getattr(module, alias.name, loaded_module(f"{source}.{alias.name}"))
+            names[alias.asname or alias.name] = part if isinstance(node, ast.ImportFrom) else module
     return names
 
 
@@ -224,8 +231,13 @@ def _is_patched(owner: Any, name: str) -> bool:
 
 def patches_in_notebook() -> Patches:
     """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
-    names, found = vars(sys.modules["__main__"]), dict[tuple[Any, str], str]()
-    for cell, text in _cells():
+    return patches_in(_cells(), vars(sys.modules["__main__"]))
+
+
+def patches_in(texts: Iterable[tuple[str, str]], names: Mapping[str, Any]) -> Patches:
+    """Return what texts change in libraries; each comes with its name in a place, and ``names`` are what it reads."""
+    found = dict[tuple[Any, str], str]()
+    for cell, text in texts:
         for written in _written_in(text):
             node = written
             while isinstance(node, ast.Attribute | ast.Subscript):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import importlib
 import io
 import re
 import sys
@@ -35,7 +34,9 @@ from epypes.bundle.expressions import (
     names_in,
     quoted,
 )
-from epypes.bundle.references import is_of_ipython
+from epypes.bundle.objects import is_installed
+from epypes.bundle.private_import import import_module, loaded_module, plain_name
+from epypes.bundle.references import imports_in, is_of_ipython
 from epypes.bundle.resolve import (
     LATE_ANNOTATIONS,
     Definition,
@@ -111,8 +112,12 @@ class Slice:
         The names that they read from outside.
     closures
         The names of closures.
+    modules
+        The modules that all of it imports, by the names that Python knows them by.
     refusals
         Why something can't be promoted.
+    patches
+        What the notebook has changed in libraries.
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
@@ -124,6 +129,7 @@ class Slice:
         self.positions: dict[str, Position] = {}
         self.reads: dict[str, frozenset[str]] = {}
         self.closures: set[str] = set()
+        self.modules: set[str] = set()
         self.refusals: list[str] = []
         self._stores_arrays = stores_arrays
         self._reserved = reserved
@@ -132,7 +138,7 @@ class Slice:
         self._unfinished: set[str] = set()
         self._makers: dict[tuple[str, str], str] = {}
         self._notebook: Mapping[str, Any] = {}
-        self._patches = patches_in_notebook()
+        self.patches = patches_in_notebook()
 
     @contextmanager
     def noted_refusals(self) -> Iterator[None]:
@@ -185,7 +191,7 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
-        check_home(home.module, home.qualname, what, self._patches)
+        check_home(home.module, home.qualname, what, self.patches)
         top = home.qualname.partition(".")[0]
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
@@ -194,23 +200,25 @@ class Slice:
 
     def module_name(self, module: str, what: str) -> str:
         """Import a module, under the name that functions or the notebook have for it (``np``); return that name."""
-        value = importlib.import_module(module)
+        value, plain = import_module(module), plain_name(module)
         imported = [name for name, known in self.imports if known == module]
         names = [name for name, known in self.read.items() if known is value] or names_of(value, self._notebook)
-        if not imported and module not in names:
+        if not imported and plain not in names:
             imported = [name for name in names if self._is_free(name, value)]
-        name = min(imported, default=module)
+        name = min(imported, default=plain)
         self._import_module(module, name, what)
         return name
 
     def _import_module(self, module: str, name: str, what: str) -> None:
-        if name == module:
-            top = module.partition(".")[0]
-            self.claim(top, _of_object(sys.modules.get(top)), what)
-            self.imports[name, module] = f"import {module}"
+        plain = plain_name(module)
+        self.modules.add(module)
+        if name == plain:
+            top = plain.partition(".")[0]
+            self.claim(top, _of_object(loaded_module(module[: len(module) - len(plain)] + top)), what)
+            self.imports[name, module] = f"import {plain}"
         else:
-            self.claim(name, _of_object(sys.modules.get(module)), what)
-            self.imports[name, module] = f"import {module} as {name}"
+            self.claim(name, _of_object(loaded_module(module)), what)
+            self.imports[name, module] = f"import {plain} as {name}"
 
     def store_array(self, array: Any, name: str, what: str) -> str:
         """Store an array as a file; return the call that reads it, or "" if files can't hold it or there are none."""
@@ -342,8 +350,9 @@ class Slice:
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
         """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
-        check_reads(found, self._patches)
+        check_reads(found, self.patches)
         read = found.reads()
+        self.modules.update(imports_in(found.node, found.names))
         self.reads[name] = frozenset(read) - {*own}
         for needed in read:
             if needed not in own:
@@ -363,17 +372,22 @@ class Slice:
         self.read[name] = value = found.names[name]
         if isinstance(value, types.ModuleType):
             # Submodules that are reached as attributes (skimage.filters) need imports of their own.
-            dotted = _submodules(found.node, name, value) if name == value.__name__ else ()
-            for module in dotted or (value.__name__,):
-                self._import_module(module, module if dotted else name, what)
+            dotted = _submodules(found.node, name, value)
+            is_plain = name == plain_name(value.__name__)
+            for module in (*(dotted if is_plain or not is_installed(value.__name__) else ()),):
+                self._import_module(module, plain_name(module), what)
+            if not dotted or not is_plain:
+                self._import_module(value.__name__, name, what)
             return
         written = literal_source(value)
         home = importable(value, name) if not written or not is_short(written) else None
         if home is not None and "." not in home.qualname:  # a nested name can't be imported by itself
-            check_home(home.module, home.qualname, what, self._patches)
+            check_home(home.module, home.qualname, what, self.patches)
             self.claim(name, _of_object(value), what)
             alias = "" if name == home.qualname else f" as {name}"
-            self.imports[name, f"{home.module}.{home.qualname}"] = f"from {home.module} import {home.qualname}{alias}"
+            self.modules.add(home.module)
+            source = plain_name(home.module)
+            self.imports[name, f"{home.module}.{home.qualname}"] = f"from {source} import {home.qualname}{alias}"
             return
         text = f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it"
         inner = f"{what}, by {name!r} ({found.place_of(name)}),"
@@ -536,7 +550,8 @@ def _makes(default: ast.expr, value: Any, names: Mapping[str, Any]) -> bool:
 
 
 def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> list[str]:
-    """Return the modules that are reached as attributes of one that is called by its own name."""
+    """Return the modules that are reached as attributes of one, which a text knows by a name."""
     dotted = {ast.unparse(node): node for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    reached = {text: evaluated(node, {name: module}) for text, node in dotted.items() if text in sys.modules}
-    return [text for text, found in reached.items() if found is sys.modules[text]]
+    named = {f"{module.__name__}{text.removeprefix(name)}": node for text, node in dotted.items()}
+    reached = {full: evaluated(node, {name: module}) for full, node in named.items() if loaded_module(full)}
+    return [full for full, found in reached.items() if found is loaded_module(full)]

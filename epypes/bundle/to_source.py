@@ -26,6 +26,8 @@ from epypes.bundle.expressions import (
 )
 from epypes.bundle.module import module_text
 from epypes.bundle.objects import is_of_library, without_nodes
+from epypes.bundle.own_modules import OwnModules
+from epypes.bundle.private_import import plain_name
 from epypes.bundle.references import global_names, meanings_of, nested_codes
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
@@ -178,7 +180,10 @@ class _Module:
         def pairs(module: Any) -> list[Pair]:
             return [(what, ours, made) for (what, ours, _), made in zip(self.compared, module.references, strict=True)]
 
-        return refusal(f"{text}references = [{sources}]\n", pairs)
+        # The modules of a bundle can be imported by its own code alone.
+        modules = OwnModules(name for name in sorted(self.gathered.modules) if plain_name(name) != name)
+        modules.check([value for _, value, _ in self.compared], self.gathered.patches)
+        return refusal(f"{text}references = [{sources}]\n", pairs, modules)
 
 
 def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dict[str, Region], list[str]]:

@@ -21,7 +21,6 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.bundle.manifest import MODULE
 from epypes.errors import MessageError, ServiceError
 from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage, buffers_of
 from epypes.service.packing import BytesLike
@@ -69,7 +68,7 @@ class WorkerProcess:
     """
 
     def __init__(self, bundle: Path, threads: int) -> None:
-        self.module = bundle / MODULE
+        self.bundle = bundle
         self._last_traces = ""
         self._lines: deque[str] = deque(maxlen=_LINES_KEPT)
         # The system may be short of descriptors, memory or threads at any of these.
@@ -169,14 +168,14 @@ class WorkerProcess:
                 if monotonic() > deadline or self.is_stopped:
                     break
                 sleep(_TRACE_PERIOD_S)
-            return functions_in_trace(self._read_traces(begin), str(self.module))
+            return functions_in_trace(self._read_traces(begin), self.bundle)
         except OSError:
             return ()
 
     @property
     def died_in(self) -> tuple[str, ...]:
         """The functions of the bundle's module that it was in when it crashed, as far as faulthandler wrote them."""
-        return functions_in_trace(self._last_traces, str(self.module))
+        return functions_in_trace(self._last_traces, self.bundle)
 
     def _read_traces(self, begin: int) -> str:
         size = min(os.fstat(self._traces).st_size - begin, _MAX_TRACE_BYTES)
@@ -192,23 +191,23 @@ class WorkerProcess:
         return status.rpartition(")")[2].split()[:1] in (["T"], ["t"])
 
 
-def functions_in_trace(text: str, module: str) -> tuple[str, ...]:
-    """Return, for each thread of a trace of faulthandler, the outermost function of a module that it is in.
+def functions_in_trace(text: str, bundle: Path) -> tuple[str, ...]:
+    """Return, for each thread of a trace of faulthandler, the outermost function of a bundle that it is in.
 
     Examples
     --------
     >>> trace = '''Thread 0x7f (most recent call first):
-    ...   File "/b/pipeline.py", line 9 in helper
+    ...   File "/b/modules/lanes.py", line 9 in helper
     ...   File "/b/pipeline.py", line 4 in match
     ...   File "/x/epypes/run/execute.py", line 30 in call
     ... '''
-    >>> functions_in_trace(trace, "/b/pipeline.py")
+    >>> functions_in_trace(trace, Path("/b"))
     ('match',)
     """
     found: list[str] = []
     for block in text.split("most recent call first):\n"):
         frames = [frame for line in block.splitlines() if (frame := _FRAME.match(line))]
-        names = [frame["name"] for frame in frames if frame["file"] == module]
+        names = [frame["name"] for frame in frames if Path(frame["file"]).is_relative_to(bundle)]
         found += names[-1:]
     return tuple(found)
 

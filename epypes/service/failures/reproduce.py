@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from epypes.bundle.manifest import MODULE
 from epypes.errors import BundleError, EpypesError
 from epypes.service.failures.record import FailedEvent, read_record, values_of, with_id
 from epypes.service.worker_connection import signal_name
@@ -57,7 +58,9 @@ class Reproduction:
     exception, message, trace
         What was raised; or how the process ended.
     line, code
-        The last line of the bundle's module that was executed: its number from 1, 0 if it is not known; and its text.
+        The last line of the bundle's code that was executed: its number from 1, 0 if it is not known; and its text.
+    file
+        The file of the bundle that has it.
     """
 
     ending: Ending
@@ -67,12 +70,13 @@ class Reproduction:
     trace: tuple[str, ...] = ()
     line: int = 0
     code: str = ""
+    file: str = MODULE
 
     @property
     def place(self) -> str:
         """Function and line, as a part of a sentence."""
         where = f"in {self.function!r}" if self.function else "in a function that is not known"
-        return f"{where}, pipeline.py, line {self.line}: {self.code}" if self.line else where
+        return f"{where}, {self.file}, line {self.line}: {self.code}" if self.line else where
 
 
 def reproduce(
@@ -144,13 +148,14 @@ def _read_result(folder: Path, scratch: Path, status: int | None, timeout_s: flo
     calls = (scratch / _CALLS).read_text(encoding="utf-8").splitlines()
     function = calls[-1] if calls else ""
     # The dump of all threads begins with the innermost frame of each.
-    own = (match for match in _DUMP_LINE.finditer(dump) if Path(match[1]).parent == folder)
+    own = (match for match in _DUMP_LINE.finditer(dump) if Path(match[1]).is_relative_to(folder))
     frame = next(own, None)
     line, code = (int(frame[2]), linecache.getline(frame[1], int(frame[2])).strip()) if frame else (0, "")
+    place = Path(frame[1]).relative_to(folder).as_posix() if frame else MODULE
     if status is None or (status == 1 and "Timeout (" in dump):
-        return Reproduction("stuck", function, "TimeoutError", f"more than {timeout_s:g} s", (), line, code)
+        return Reproduction("stuck", function, "TimeoutError", f"more than {timeout_s:g} s", (), line, code, place)
     ended = f"status {status}" if status >= 0 else signal_name(-status)
-    return Reproduction("killed", function, ended, "the process ended with it", (), line, code)
+    return Reproduction("killed", function, ended, "the process ended with it", (), line, code, place)
 
 
 # -- in the process of its own ----------------------------------------------------------------------------------------
@@ -211,7 +216,8 @@ def _log_calls(pipeline: FullPipeline, file: Path) -> None:
 
 def _reproduction(failure: Failure, folder: Path) -> Reproduction:
     exception = failure.exception
-    own = [frame for frame in traceback.extract_tb(exception.__traceback__) if Path(frame.filename).parent == folder]
+    frames = traceback.extract_tb(exception.__traceback__)
+    own = [frame for frame in frames if Path(frame.filename).is_relative_to(folder)]
     trace = "".join(traceback.format_exception(exception)).splitlines()
     return Reproduction(
         "failed",
@@ -221,6 +227,7 @@ def _reproduction(failure: Failure, folder: Path) -> Reproduction:
         tuple(trace[-100:]),
         (own[-1].lineno or 0) if own else 0,
         (own[-1].line or "") if own else "",
+        Path(own[-1].filename).relative_to(folder).as_posix() if own else MODULE,
     )
 
 
