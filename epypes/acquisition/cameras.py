@@ -64,7 +64,8 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
     Parameters
     ----------
     source
-        - the path of an image, of a folder (its images by name, ``img2`` before ``img10``) or of a video;
+        - the path of an image, of a folder (its images by name, ``img2`` before ``img10``) or of a video, and what
+          `epypes.video` returns;
         - an array (y, x) or (y, x, channels): a copy of it again and again;
         - the number of a device, or the URL of a stream;
         - an opened ``cv2.VideoCapture``, which is yours to release, or a function that returns one, which is called
@@ -110,20 +111,24 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
         return _still_camera(source, fps, loop)
     if _is_capture(source):
         return _of_capture(source, fps, loop)
-    if isinstance(source, Video):
-        return paced(SequenceCamera(source.frames, loop), fps, source.fps or USUAL_FPS)
     if _is_camera(source):
         return paced(source, fps)
-    if isinstance(source, Iterator):
-        return paced(SequenceCamera(lambda: source, loop=False), fps)
     if isinstance(source, Iterable) and not isinstance(source, bytes | bytearray | memoryview | dict | set | frozenset):
-        return paced(SequenceCamera(lambda: source, loop), fps, USUAL_FPS)
+        return _of_iterable(source, fps, loop)
     if callable(source):
         return _of_function(source, fps, loop)
     raise TypeError(
         f"A camera can't be made of {type(source).__name__!r}. Give a path, an array, the number of a device, a "
         "cv2.VideoCapture, an iterable of arrays, or an object with read() and close()."
     )
+
+
+def _of_iterable(source: Iterable[Any], fps: float | None, loop: bool) -> IterableCamera:
+    if isinstance(source, Iterator):
+        return paced(SequenceCamera(lambda: source, loop=False), fps)
+    if isinstance(source, Video):
+        return paced(SequenceCamera(source.frames, loop), fps, source.fps or USUAL_FPS)
+    return paced(SequenceCamera(lambda: source, loop), fps, USUAL_FPS)
 
 
 def has_twins(sources: Iterable[Any]) -> bool:
@@ -134,9 +139,7 @@ def has_twins(sources: Iterable[Any]) -> bool:
     return len(set(single)) < len(single)
 
 
-def _of_capture(
-    source: Any, fps: float | None, loop: bool, opening: Callable[[], Any] | None = None
-) -> IterableCamera:
+def _of_capture(source: Any, fps: float | None, loop: bool, opening: Callable[[], Any] | None = None) -> IterableCamera:
     """Return the camera on a device, a stream, or a capture that the caller has opened.
 
     Parameters
@@ -430,9 +433,7 @@ class LiveCamera:
                 self._lock.release()
 
 
-def _capture_camera(
-    capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool
-) -> IterableCamera:
+def _capture_camera(capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool) -> IterableCamera:
     import cv2
 
     unread = [capture]

@@ -26,8 +26,8 @@ class Frame:
     captured_ns
         When the camera gave it, Unix time in ns.
     number
-        Its place in the camera's stream: from 1 in an ImageAcquisition, from 0 in a video and where a camera is iterated
-        over.
+        Its place in the camera's stream: from 1 in an ImageAcquisition, from 0 in a video and in a ``for`` over a
+        camera.
     time_s
         Of a video, its time since the first frame, in s; None of what has no times.
     """

@@ -97,20 +97,14 @@ class Video(Sequence["Pixels"]):
         last_s = self._file.time_s(len(self._file.pts) - 1)
         return round((len(self._file.pts) - 1) / last_s, 6) if last_s else 0.0
 
-    def frame(self, place: int) -> VideoFrame:
-        """Return a reference to a frame, which is not read yet; IndexError if there is no such place."""
-        return VideoFrame(self, self.numbers[place])
-
     def frames(self) -> Iterator[Frame]:
         """Yield the frames with their numbers and times; those that are damaged are left out. None is kept."""
         for number in self.numbers:
             # Without a name here, which would be one more reference to the image, the reader need not copy it.
             with suppress(UnreadableFrame):
-                yield Frame(
-                    self._file.image(number, is_kept=False), time.time_ns(), number, self._file.time_s(number)
-                )
+                yield Frame(self._file.image(number, is_kept=False), time.time_ns(), number, self._file.time_s(number))
 
-    def read(self, number: int, order: Order = "bgr") -> Pixels:
+    def image(self, number: int, order: Order = "bgr") -> Pixels:
         """Return the frame of a number in the file, with its colours in an order.
 
         Raises
@@ -118,7 +112,8 @@ class Video(Sequence["Pixels"]):
         ImageFileError
             It is damaged.
         """
-        return self._file.image(number, order)
+        image: Pixels = self._file.image(number, order)
+        return image
 
     def number_of(self, image: object) -> int | None:
         """Return the number of the frame that an array was read from, of this file and still in use; else None."""
@@ -142,9 +137,11 @@ class Video(Sequence["Pixels"]):
     def __getitem__(self, index: int | slice) -> Pixels | Video:
         if not isinstance(index, slice):
             try:
-                return self._file.image(self.numbers[index])
+                number = self.numbers[index]
             except IndexError:
-                raise IndexError(f"{self.path.name} has no frame {index}: it has {len(self):,}, from 0.") from None
+                text = f"There is no frame {index} of {str(self.path)!r}: it has {len(self):,}, counted from 0."
+                raise IndexError(text) from None
+            return self.image(number)
         part: Video = object.__new__(Video)
         part._file, part.path, part.numbers = self._file, self.path, self.numbers[index]
         return part
@@ -156,6 +153,29 @@ class Video(Sequence["Pixels"]):
         size = f"{len(self):,} frame{'s' * (len(self) != 1)}"
         lasts = self._file.time_s(self.numbers[-1]) - self._file.time_s(self.numbers[0]) if self.numbers else 0.0
         return f"<Video {self.path.name:.40}: {size}, {lasts:.3f} s>"
+
+
+def video(path: str | Path) -> Video:
+    """Return the frames of a video file as a sequence of images, each read when it is asked for.
+
+    Parameters
+    ----------
+    path
+        The file, of any container and codec that PyAV decodes.
+
+    Returns
+    -------
+    Video
+        Has a length, indices, slices, ``times_s`` and ``fps``. It is taken wherever images are: by ``ep.map``,
+        ``ep.sweep``, ``ep.check``, ``ep.optimize``, ``ep.camera`` and ``tune``. So is the path of a file that has the
+        ending of a video.
+
+    Raises
+    ------
+    ImageFileError
+        The file is no video, or can't be decoded; as for `Video`.
+    """
+    return Video(path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +206,7 @@ class VideoFrame:
     @property
     def image(self) -> Pixels:
         """Its pixels, BGR; ImageFileError if they are damaged."""
-        return self.video.read(self.number)
+        return self.video.image(self.number)
 
     def __repr__(self) -> str:
         return f"<VideoFrame {self.name}, {self.time_s:.3f} s>"
@@ -240,7 +260,9 @@ def _index_of(path: Path) -> _Index:
                 if packet.stream is not stream:
                     continue
                 if stamp is None:
-                    text = f"The frames of {str(path)!r} have no times. Put them into a container: ffmpeg -i {path.name} "
+                    text = (
+                        f"The frames of {str(path)!r} have no times. Put them into a container: ffmpeg -i {path.name} "
+                    )
                     raise ImageFileError(str(path), f"{text}-c copy {path.stem}.mkv")
                 if packet.is_keyframe:
                     keys.add(stamp)
@@ -286,7 +308,9 @@ def _open(path: Path) -> tuple[Any, Any]:
         text = f"Video '{name:.200}' can't be read: {error.strerror}. Check the path."
         raise ImageFileError(name, text) from error
     if is_folder:
-        text = f"{name!r} is a folder, no video. ep.map and ep.camera take a folder of images; of videos, give one file."
+        text = (
+            f"{name!r} is a folder, no video. ep.map and ep.camera take a folder of images; of videos, give one file."
+        )
         raise ImageFileError(name, text)
     if not size:
         raise ImageFileError(name, f"{name!r} is empty. Copy or record the video again.")
@@ -295,14 +319,14 @@ def _open(path: Path) -> tuple[Any, Any]:
         container = av.open(str(path.absolute()), metadata_errors="ignore")
     except av.FFmpegError as error:
         raise ImageFileError(name, _unopened_text(path)) from error
-    stream = container.streams.best("video")
+    stream: Any = container.streams.best("video")
     if stream is None:
         container.close()
         raise ImageFileError(name, f"{name!r} has no video in it. Check the path, or record it again.")
     if stream.codec_context is None:
         container.close()
-        text = f"The codec of {name!r} is unknown to this FFmpeg, so its frames can't be decoded. Convert it with a program"
-        raise ImageFileError(name, f"{text} that knows it: ffmpeg -i {path.name} -c:v libx264 {path.stem}_h264.mp4")
+        text = f"The frames of {name!r} can't be decoded: PyAV has no codec for them. Convert it where there is one:"
+        raise ImageFileError(name, f"{text} ffmpeg -i {path.name} -c:v libx264 {path.stem}_h264.mp4")
     stream.thread_type = "AUTO"
     return container, stream
 
@@ -324,7 +348,7 @@ def _unopened_text(path: Path) -> str:
             kind = b""
     if is_mp4 and kind != b"moov":
         return (
-            f"{str(path)!r} was cut off: its index, which an .mp4 has at its end, is missing, so no frame can be found. "
+            f"{str(path)!r} was cut off: its index is missing, which an .mp4 has at its end, so no frame can be found. "
             "Record it again; an .avi or .mkv can be read as far as it goes."
         )
     return f"{str(path)!r} is neither an image nor a video that can be read. Use .mp4, .avi, .mkv, .mov or .webm."
@@ -432,7 +456,9 @@ class _VideoFile:
         return image
 
     def _unreadable(self, number: int) -> UnreadableFrame:
-        text = f"Frame {number} of {str(self.path)!r} can't be decoded: the file is damaged or cut off there. Leave it out."
+        text = (
+            f"Frame {number} of {str(self.path)!r} can't be decoded: the file is damaged there. Leave this frame out."
+        )
         return UnreadableFrame(str(self.path), text)
 
     def _go_before(self, number: int) -> None:
