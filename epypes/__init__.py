@@ -34,7 +34,19 @@ if TYPE_CHECKING:
     from epypes.batch.optimize import optimize
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
-    from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
+    from epypes.graph import (
+        CompGraph,
+        Placeholder,
+        delay,
+        extend,
+        group,
+        outputs,
+        rename,
+        subgraph,
+        suffix,
+        switch,
+        union,
+    )
     from epypes.hints import Param, Roi
     from epypes.images import Image
     from epypes.pipeline import (
@@ -75,6 +87,7 @@ _HOMES = {
     "show": "epypes.display",
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
+    "delay": "epypes.graph",
     "extend": "epypes.graph",
     "group": "epypes.graph",
     "outputs": "epypes.graph",
@@ -171,6 +184,7 @@ __all__ = [
     "camera",
     "check",
     "connect",
+    "delay",
     "errors",
     "extend",
     "group",

@@ -1,6 +1,7 @@
 """What is connected to what: computational graphs, pure and static."""
 
 from epypes.graph.algebra import (
+    delay,
     extend,
     group,
     names_of,
@@ -17,14 +18,17 @@ from epypes.graph.placeholder import Placeholder, is_placeholder
 from epypes.graph.signature import outputs
 from epypes.graph.switch import Switch, as_switch, switch
 from epypes.graph.token_annotations import annotated_params, colour_order, image_hint
+from epypes.graph.validation import Delay
 
 __all__ = [
     "CompGraph",
+    "Delay",
     "Placeholder",
     "Switch",
     "annotated_params",
     "as_switch",
     "colour_order",
+    "delay",
     "extend",
     "group",
     "image_hint",

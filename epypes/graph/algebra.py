@@ -1,4 +1,4 @@
-"""Algebra of graphs: union, extension, renaming, subgraphs and groups, each of which makes a new graph."""
+"""Algebra of graphs: union, extension, renaming, subgraphs, groups and delays, each of which makes a new graph."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.compgraph import CompGraph, FuncIO
-from epypes.graph.identity import have_one_name, is_same_function
+from epypes.graph.identity import have_one_name, is_same_default, is_same_function
 from epypes.graph.placeholder import is_placeholder
-from epypes.graph.validation import Default, GraphParts
+from epypes.graph.validation import Default, Delay, GraphParts
 
 
 def union(*graphs: CompGraph, suffixes: Sequence[str] | None = None, keep: str | Iterable[str] = ()) -> CompGraph:
@@ -63,6 +63,14 @@ def _merge(merged: GraphParts, part: GraphParts) -> None:
     """Add a part; a function or group that is there already is added to the findings unless it is the same."""
     merged.findings.extend(part.findings)
     merged.defaults.extend(part.defaults)
+    for previous, delayed in part.delays.items():
+        first = merged.delays.setdefault(previous, delayed)
+        if first.token != delayed.token or not is_same_default(first.initial, delayed.initial):
+            text = (
+                f"Token {previous!r} is the previous value of {first.token!r} in one graph and of {delayed.token!r} in "
+                "another, or begins with another value there. Rename one of them with ep.rename()."
+            )
+            merged.findings.append(Finding("delay", text, (previous, first.token, delayed.token)))
     for name, group_name in part.groups.items():
         other = merged.groups.setdefault(name, group_name)
         if other != group_name:
@@ -132,7 +140,7 @@ def extend(cg: CompGraph, func_dict: Mapping[str, Callable[..., Any]], func_io: 
 
 
 def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
-    """Return the graph of the functions that tokens need, every branch of a switch included.
+    """Return the graph of the functions that tokens need, every branch of a switch and every delayed token included.
 
     Parameters
     ----------
@@ -157,12 +165,19 @@ def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
     for token in pending:
         cg.require_token(token)
     needed: set[str] = set()
+    found = set(pending)
     while pending:
-        function = cg.digraph.producer.get(pending.pop())
+        token = pending.pop()
+        function = cg.digraph.producer.get(token)
+        read = [cg.delays[token].token] if token in cg.delays else []
         if function is not None and function not in needed:
             needed.add(function)
-            pending.extend(cg.digraph.inputs[function])
+            read.extend(cg.digraph.inputs[function])
+        pending.extend(other for other in read if other not in found)
+        found.update(read)
     parts = cg._parts()
+    for token in [token for token in parts.delays if token not in found]:
+        del parts.delays[token]
     for name in [name for name in parts.functions if name not in needed]:
         del parts.functions[name], parts.func_io[name]
         parts.groups.pop(name, None)
@@ -270,6 +285,10 @@ def _renamed(cg: CompGraph, functions: Mapping[str, str], tokens: Mapping[str, s
         {new[name]: group for name, group in parts.groups.items()},
         parts.types,
         findings,
+        {
+            tokens.get(token, token): Delay(tokens.get(delayed, delayed), initial)
+            for token, (delayed, initial) in parts.delays.items()
+        },
     )
 
 
@@ -329,6 +348,49 @@ def group(cg: CompGraph, name: str, functions: str | Iterable[str]) -> CompGraph
             text = f"Function {function!r} is in the group {other!r} already. A function is in one group at most."
             parts.findings.append(Finding("groups", text, (function, other)))
         parts.groups[function] = name
+    return _built(parts)
+
+
+def delay(cg: CompGraph, token: str, previous: str, initial: Any = None) -> CompGraph:
+    """Add a unit delay to a graph: state between its runs, as the unit delay of Simulink and ``pre`` of Lustre.
+
+    In each run the source token ``previous`` has the value that ``token`` had at the end of the last completed run, and
+    ``initial`` in the first one. A ``rerun`` and a ``trial`` see the same previous value as the run that they repeat. A
+    run that fails, or does not compute ``token``, leaves the state as it was.
+
+    Parameters
+    ----------
+    cg
+        The graph; it stays as it is.
+    token
+        Any token of the graph.
+    previous
+        A source token of the graph. It is then neither free nor a hyperparameter.
+    initial
+        The value of ``previous`` in the first run, and after ``runner.reset()``.
+
+    Raises
+    ------
+    GraphError
+        A function makes ``previous``, it is delayed already, or it is ``token`` itself.
+    UnknownName
+        The graph has no such token.
+
+    Examples
+    --------
+    >>> cg = CompGraph({"add": lambda x, before: x + before}, {"add": (("x", "before"), "total")})
+    >>> delay(cg, "total", "before", initial=0).delays["before"]
+    Delay(token='total', initial=0)
+    """
+    _require_graph("delay()", cg)
+    for name in (token, previous):
+        cg.require_token(name)
+    parts = cg._parts()
+    if previous in cg.delays:
+        known = cg.delays[previous].token
+        text = f"Token {previous!r} is the previous value of {known!r} already. Read another token, or build it anew."
+        parts.findings.append(Finding("delay", text, (previous, known, token)))
+    parts.delays[previous] = Delay(token, initial)
     return _built(parts)
 
 

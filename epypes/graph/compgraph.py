@@ -15,7 +15,7 @@ from epypes.graph.placeholder import is_placeholder
 from epypes.graph.signature import declared_outputs, positional_of, signature_of
 from epypes.graph.switch import as_switch
 from epypes.graph.token_annotations import read_contracts
-from epypes.graph.validation import Default, GraphParts, find_problems, read_io
+from epypes.graph.validation import Default, Delay, GraphParts, find_problems, read_io
 from epypes.images import Contracts
 from epypes.optional import optional_import
 from epypes.rich_display import mimebundle
@@ -133,7 +133,12 @@ class CompGraph:
         special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
         self._placeholders = tuple(name for name, function in special if is_placeholder(function))
         self._switches = tuple(name for name, function in special if as_switch(function) is not None)
-        defaults = {default.token: default.value for default in reversed(parts.defaults)}
+        self._delays = MappingProxyType(
+            {token: parts.delays[token] for token in self._sources if token in parts.delays}
+        )
+        defaults = {
+            default.token: default.value for default in reversed(parts.defaults) if default.token not in parts.delays
+        }
         self._defaults = MappingProxyType({token: defaults[token] for token in self._sources if token in defaults})
         groups: dict[str, list[str]] = {}
         for function in order:
@@ -151,6 +156,7 @@ class CompGraph:
             [Default(token, value, consumers[token][0]) for token, value in self._defaults.items()],
             {function: group_of[function] for function in self._functions if function in group_of},
             self._types,
+            delays=dict(self._delays),
         )
 
     @property
@@ -187,6 +193,11 @@ class CompGraph:
     def defaults(self) -> Mapping[str, Any]:
         """The default values of source tokens, in graph order; only ``from_functions`` finds any."""
         return self._defaults
+
+    @property
+    def delays(self) -> Mapping[str, Delay]:
+        """By source token, in graph order, the token whose previous value it has; see ``ep.delay``."""
+        return self._delays
 
     @property
     def placeholders(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import reprlib
 from collections.abc import Callable, Iterable, Mapping
@@ -34,6 +35,21 @@ class Default(NamedTuple):
     function: str
 
 
+class Delay(NamedTuple):
+    """The delay of a token.
+
+    Attributes
+    ----------
+    token
+        The token whose value is kept for the next run.
+    initial
+        The value in the first run.
+    """
+
+    token: str
+    initial: Any
+
+
 @dataclass(frozen=True, slots=True)
 class GraphParts:
     """What a graph is put together from: not a graph yet.
@@ -50,6 +66,8 @@ class GraphParts:
         Whether annotations are compared.
     findings
         What is already known to be wrong.
+    delays
+        By source token, the token whose previous value it has.
     """
 
     functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
@@ -58,6 +76,7 @@ class GraphParts:
     groups: dict[str, str] = field(default_factory=dict)
     types: bool = True
     findings: list[Finding] = field(default_factory=list)
+    delays: dict[str, Delay] = field(default_factory=dict)
 
 
 def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[BipartiteDigraph, dict[str, Any]]:
@@ -139,6 +158,7 @@ def find_problems(
     # A token that is made needs no default.
     yield from _check_defaults(default for default in parts.defaults if default.token not in digraph.producer)
     yield from _check_groups(functions, parts.groups)
+    yield from _check_delays(parts.delays, digraph)
 
 
 def _check_pairing(functions: Mapping[Any, Any], func_io: Mapping[str, Any]) -> Iterable[Finding]:
@@ -252,3 +272,24 @@ def _check_groups(functions: Mapping[str, Any], groups: Mapping[str, str]) -> It
                 "Give the group another name, or rename the function with ep.rename()."
             )
             yield Finding("groups", text, (name,))
+
+
+def _check_delays(delays: Mapping[str, Delay], digraph: BipartiteDigraph) -> Iterable[Finding]:
+    """Find delays of tokens that are made or that do not exist."""
+    tokens = digraph.tokens() if delays else {}
+    for previous, (token, _) in delays.items():
+        maker = digraph.producer.get(previous)
+        if previous == token:
+            text = f"Token {previous!r} can't be its own previous value. Have a function take {previous!r} and make it."
+            yield Finding("delay", text, (previous,))
+        elif maker is not None:
+            text = (
+                f"Token {previous!r} is the previous value of {token!r}, but function {maker!r} makes it. "
+                "A delayed value is a source token: rename one of the two."
+            )
+            yield Finding("delay", text, (previous, maker))
+        elif token not in tokens:
+            near = difflib.get_close_matches(token, tokens, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            text = f"Token {previous!r} is the previous value of {token!r}, which is no token of the graph.{hint}"
+            yield Finding("delay", text, (previous, token))

@@ -109,6 +109,30 @@ class Pipeline(Node, TokenMapping):
         return self.runner.revision, *self.runner._program.revisions(around)
 
     @property
+    def __epypes_initial_state__(self) -> Mapping[str, Any]:
+        """The state between runs before the first one; empty without any."""
+        return {slots.key: slots.initial for slots in self.runner._program.states}
+
+    def __epypes_call_with_state__(self, state: Mapping[str, Any], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
+        """Call the pipeline with a state that the caller keeps; return its value and the state after."""
+        with self.runner._series:
+            self.runner.state = state
+            return self(*inputs), self.runner.state
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """What the next run begins with; see ``CompGraphRunner.state``."""
+        return self.runner.state
+
+    @state.setter
+    def state(self, values: Mapping[str, Any]) -> None:
+        self.runner.state = values
+
+    def reset(self) -> None:
+        """Have the next run begin with the initial state; see ``CompGraphRunner.reset``."""
+        self.runner.reset()
+
+    @property
     def cg(self) -> CompGraph:
         """The graph as it was given, with the user's own functions."""
         return self.source_cg
@@ -144,12 +168,9 @@ class Pipeline(Node, TokenMapping):
 
     # What an EventLoop asks of its pipeline.
 
-    def _react(self, event: Any, f_in: Callable[[Any], Mapping[str, Any]] | None) -> None:
-        """Run for an event; without f_in it is the only input."""
-        if f_in is None:
-            self(event)
-        else:
-            self.run(**f_in(event))
+    def _reaction(self, f_in: Callable[[Any], Mapping[str, Any]] | None) -> Callable[[Any], object]:
+        """Return what is called with each event: without f_in the event is the only input."""
+        return self if f_in is None else lambda event: self.run(**f_in(event))
 
     def _has_settled(self, event: Any) -> bool:
         """Whether the pipeline has acknowledged or rejected the event itself."""

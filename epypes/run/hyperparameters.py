@@ -68,10 +68,11 @@ class Hyperparameters:
 
     @property
     def free_slots(self) -> dict[str, int]:
-        """The slots of the source tokens that are not frozen, in order of first appearance in func_io."""
+        """The slots of the source tokens that are neither frozen nor delayed, by first appearance in func_io."""
         if self._free_slots is None:
             slots, sources = self.program.slots, self.program.cg.source_tokens
-            self._free_slots = {token: slots[token] for token in sources if token not in self.entries}
+            taken = {**self.entries, **self.program.cg.delays}
+            self._free_slots = {token: slots[token] for token in sources if token not in taken}
         return self._free_slots
 
     @property
@@ -175,6 +176,8 @@ class Hyperparameters:
         if maker is not None:
             text = f"Token {token!r} is made by function {maker!r}, so it can't be a hyperparameter."
             raise HyperparameterError(token, text)
+        if token in cg.delays:
+            raise HyperparameterError(token, _is_delayed(token, cg.delays[token].token))
 
     def require_branches(self, values: Mapping[str, Any]) -> None:
         """Raise UnknownName, with the nearest name, unless switches have the branches that these tokens select."""
@@ -201,9 +204,15 @@ class Hyperparameters:
         maker = cg.digraph.producer.get(token)
         if maker is not None:
             text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
+        elif token in cg.delays:
+            text = _is_delayed(token, cg.delays[token].token)
         else:
             text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
         return PayloadError((token,), text)
+
+
+def _is_delayed(token: str, of: str) -> str:
+    return f"Token {token!r} is the previous value of {of!r}. Set it by runner.state = {{{token!r}: ...}}."
 
 
 _new_hyperparameters: Final[Callable[[], Hyperparameters]] = partial(object.__new__, Hyperparameters)

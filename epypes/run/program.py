@@ -13,10 +13,11 @@ from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, Final, NamedTuple
 from weakref import ref
 
+from epypes.errors import Finding, GraphError
 from epypes.graph import CompGraph, Switch, as_switch
 from epypes.graph.signature import distinct
 from epypes.images import Contracts
-from epypes.run.guard import called_for, is_unguarded
+from epypes.run.guard import called_for, is_unguarded, keep
 
 # What a function has that keeps hyperparameters of its own: a method that returns another value whenever they have
 # changed, given the programs that ask for it.
@@ -25,6 +26,10 @@ REVISION: Final = "__epypes_revision__"
 # count the call when the run has ended.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
 MAX_UNCOUNTED: Final = 100
+# What a function has that keeps state between its calls: by key, the state before the first call; and a method that
+# takes a state and inputs, and returns the value and the state after.
+INITIAL_STATE: Final = "__epypes_initial_state__"
+CALL_WITH_STATE: Final = "__epypes_call_with_state__"
 # More objects than any function refers to on purpose.
 _MOST_REACHED: Final = 1_000
 
@@ -65,6 +70,25 @@ class Step(NamedTuple):
     node: Any
 
 
+class StateSlots(NamedTuple):
+    """Where a value is that is kept between runs.
+
+    Attributes
+    ----------
+    key
+        The delayed token; of a nested pipeline ``"function.key"``.
+    before, after
+        The slots that it is read from, and that the next run's is taken from.
+    initial
+        Its value in the first run.
+    """
+
+    key: str
+    before: int
+    after: int
+    initial: Any
+
+
 class Program:
     """A compiled graph; nothing in it changes but ``running``.
 
@@ -77,9 +101,11 @@ class Program:
     check_mutation
         Whether each call is checked for changes to its inputs.
     tokens
-        The tokens by slot.
+        The tokens by slot; after those of the graph, the states of nested pipelines.
     slots
-        The slots by token.
+        The slots by token of the graph.
+    states
+        What is kept between runs.
     steps
         The functions, in run order.
     switches, placeholders
@@ -100,9 +126,18 @@ class Program:
     """
 
     def __init__(self, cg: CompGraph, guard: bool, check_mutation: bool = False) -> None:
-        self.cg, self.guard, self.check_mutation, self.tokens = cg, guard, check_mutation, cg.tokens
+        self.cg, self.guard, self.check_mutation = cg, guard, check_mutation
         self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
-        self.steps = steps = tuple(_steps(cg, slots, guard and not check_mutation))
+        found_steps = _steps(cg, slots, guard and not check_mutation)
+        nested: list[StateSlots] = []
+        self.steps = steps = tuple(_with_state_slots(found_steps, len(slots), nested))
+        self.tokens = (*cg.tokens, *(name for state in nested for name in (state.key, f"{state.key}, new")))
+        delays = cg.delays.items()
+        own = [StateSlots(token, slots[token], slots[delay.token], delay.initial) for token, delay in delays]
+        self.states = tuple(
+            state._replace(initial=keep(state.initial, 0, self, state.before, ()) if guard else state.initial)
+            for state in (*own, *nested)
+        )
         self.nodes = tuple((step.place, step.node) for step in steps if step.node is not None)
         self.uncounted: deque[Mapping[int, int]] | None = deque() if self.nodes else None
         for _, node in self.nodes:
@@ -112,7 +147,7 @@ class Program:
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
-        found = {
+        found: dict[int, tuple[object, ...]] = {
             key: objects
             for key, function in distinct(cg.functions).items()
             if not _is_alone(function) and (objects := tuple(_with_revisions(function)))
@@ -120,6 +155,7 @@ class Program:
         revised = [step for step in steps if id(cg.functions[step.name]) in found] if found else []
         self.revised = tuple(step.place for step in revised)
         self._with_revisions = tuple(found[id(cg.functions[step.name])] for step in revised)
+        self._require_visible_state()
         self.selectors: dict[str, list[Switch]] = {}
         for place in self.switches:
             step = steps[place]
@@ -131,7 +167,7 @@ class Program:
     @cached_property
     def makers(self) -> Sequence[int]:
         """By slot, the step that writes it, or -1 for a source token."""
-        makers = [-1] * len(self.slots)
+        makers = [-1] * len(self.tokens)
         for step in self.steps:
             for slot in step.outputs:
                 makers[slot] = step.place
@@ -140,11 +176,28 @@ class Program:
     @cached_property
     def consumers(self) -> Sequence[Sequence[int]]:
         """By slot, the steps that read it, in run order."""
-        consumers: list[list[int]] = [[] for _ in self.slots]
+        consumers: list[list[int]] = [[] for _ in self.tokens]
         for step in self.steps:
             for slot in dict.fromkeys(step.inputs):
                 consumers[slot].append(step.place)
         return consumers
+
+    def _require_visible_state(self) -> None:
+        """Raise unless pipelines with state are functions of the graph themselves: so a rerun repeats their state."""
+        for place, reached in zip(self.revised, self._with_revisions, strict=True):
+            name = self.steps[place].name
+            for pipeline in reached:
+                if pipeline is not self.cg.functions[name] and getattr(pipeline, INITIAL_STATE, None):
+                    text = (
+                        f"Function {name!r} calls the pipeline {getattr(pipeline, 'name', '')!r}, which has state "
+                        "between runs that a rerun could not repeat. Make the pipeline itself a function of the graph."
+                    )
+                    raise GraphError([Finding("delay", text, (name,))])
+
+    def begin(self, values: list[Any], state: Sequence[Any]) -> None:
+        """Write a state into the values by slot with which a run begins."""
+        for slots, value in zip(self.states, state, strict=True):
+            values[slots.before] = value
 
     def revisions(self, around: tuple[Program, ...] = ()) -> tuple[Any, ...]:
         """Return the present revisions of the functions that have one.
@@ -197,6 +250,36 @@ class Program:
                         found.add(index)
                         pending.append(index)
         return found
+
+
+def _with_state_slots(steps: Iterable[Step], count: int, states: list[StateSlots]) -> Iterator[Step]:
+    """Give steps; those that have state read and write it in slots of their own, after the ``count`` of the graph."""
+    for step in steps:
+        initial = getattr(step.function, INITIAL_STATE, None) if type(step.function) is not FunctionType else None
+        if not initial:
+            yield step
+            continue
+        start = count + 2 * len(states)
+        own = [
+            StateSlots(f"{step.name}.{key}", start + 2 * place, start + 2 * place + 1, value)
+            for place, (key, value) in enumerate(initial.items())
+        ]
+        states.extend(own)
+        yield step._replace(
+            function=partial(_call_with_state, step.function, tuple(initial), step.single),
+            inputs=(*step.inputs, *(state.before for state in own)),
+            outputs=(*step.outputs, *(state.after for state in own)),
+            single=False,
+        )
+
+
+def _call_with_state(function: Any, keys: tuple[str, ...], single: bool, *args: Any) -> Any:
+    inputs, state = args[: -len(keys)], args[-len(keys) :]
+    value, after = getattr(function, CALL_WITH_STATE)(dict(zip(keys, state, strict=True)), inputs)
+    made = (
+        (value,) if single else () if value is None else tuple(value) if isinstance(value, tuple | list) else (value,)
+    )
+    return *made, *(after[key] for key in keys)
 
 
 def _is_alone(function: Any) -> bool:

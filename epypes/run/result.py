@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
@@ -87,6 +88,23 @@ class Run(TokenMapping):
     def revision(self) -> int:
         """The runner's count of hyperparameter changes when the run began."""
         return self.record[4].revision
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """What the next run begins with, by delayed token; see ``ep.delay``. Of a failed run, what it began with."""
+        states, guard = self.record[4].program.states, self.record[4].program.guard
+        values = zip(states, self.state_after(), strict=True)
+        known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
+        return MappingProxyType({key: lend(value) if guard else value for key, value in known.items()})
+
+    def state_after(self) -> tuple[Any, ...]:
+        """Return the values of ``state`` as they are stored, in the order of the program's states."""
+        values, *_, failure = self.record
+        # Of a rerun for other targets the value may be stale: it is still what the frame has left.
+        return tuple(
+            values[slots.before] if failure or values[slots.after] is NOT_COMPUTED else values[slots.after]
+            for slots in self.record[4].program.states
+        )
 
     @property
     def cg(self) -> CompGraph:

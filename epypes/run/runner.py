@@ -5,16 +5,18 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from copy import copy
 from time import perf_counter_ns
+from types import MappingProxyType
 from typing import Any, Final
 from weakref import ref
 
-from epypes.errors import NotComputed, PayloadError, StaleToken, require_mapping, run_call
+from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
 from epypes.run.execute import CompiledRun, Executor
 from epypes.run.failure import failure_of
-from epypes.run.guard import COPIERS, lend, require_reusable
+from epypes.run.guard import COPIERS, keep, lend, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
@@ -27,6 +29,7 @@ Payload = Mapping[str, Any]
 
 _LOG: Final = logging.getLogger(__name__)
 _MAX_TARGETS: Final = 64
+_NO_SERIES: Final = nullcontext()
 
 
 class CompGraphRunner(TokenMapping):
@@ -99,6 +102,7 @@ class CompGraphRunner(TokenMapping):
         self._wanted: dict[tuple[str, ...], bytes] = {}
         self._own_state()
         self.last: Run | None = None
+        self._kept = self._initial_state()
         given = {**cg.defaults, **hparams}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
 
@@ -113,6 +117,8 @@ class CompGraphRunner(TokenMapping):
         self._keep_times = self.reports.kept.append
         # The run that failed last on each thread: `last` may be another thread's run by then.
         self._failed = threading.local()
+        # Held by a run with state: the next one begins with what it leaves.
+        self._series = threading.RLock()
 
     # -- running ------------------------------------------------------------------------------------------------
 
@@ -153,8 +159,9 @@ class CompGraphRunner(TokenMapping):
         start_ns = perf_counter_ns()
         hparams, program = self._hparams, self._program
         repeated = hparams.repeated
-        if repeated is None or targets or len(payload) != len(repeated[2]):
-            return self._run_from_scratch(hparams, payload, targets, start_ns, None)
+        if repeated is None or targets or program.states or len(payload) != len(repeated[2]):
+            with self._series if program.states else _NO_SERIES:
+                return self._run_from_scratch(hparams, payload, targets, start_ns, None)
         # A stream of images goes this way: as short as can be.
         compiled, base, slots = repeated
         values = base.copy()
@@ -174,16 +181,23 @@ class CompGraphRunner(TokenMapping):
         targets: Sequence[str],
         start_ns: int,
         trial_of: TrialOf | None,
+        state: Sequence[Any] | None = None,
     ) -> Run:
-        """Run everything that the targets need, everything without, on a payload."""
+        """Run what the targets need, everything without, on a payload and a state, by default the runner's own."""
         self._require_targets(targets)
-        values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
-        tokens = TokenManager.from_scratch(self._program, values, has_payload)
+        tokens = self._beginning(hparams, payload, self._kept if state is None else state)
         try:
             return self._run(tokens, hparams, targets, payload, start_ns, trial_of)
         finally:
-            if hparams.repeated is None and (compiled := self._executor.whole(hparams.plain)) is not None:
+            is_short = perf_counter_ns() - start_ns < self._executor.short_ns
+            if hparams.repeated is None and is_short and (compiled := self._executor.whole(hparams.plain)) is not None:
                 hparams.repeated = compiled, hparams.base, hparams.free_slots
+
+    def _beginning(self, hparams: Hyperparameters, payload: Payload, state: Sequence[Any]) -> TokenManager:
+        """Return the tokens of a run from scratch, before its first step."""
+        values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
+        self._program.begin(values, state)
+        return TokenManager.from_scratch(self._program, values, has_payload)
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -199,6 +213,9 @@ class CompGraphRunner(TokenMapping):
         Exception
             Whatever a function raises, unchanged, with a note.
         """
+        if self._program.states:
+            with self._series:
+                return self._go_on(changes, targets, False)
         return self._go_on(changes, targets, False)
 
     def _go_on(self, changes: Mapping[str, Any], targets: tuple[str, ...], is_trial: bool) -> Run:
@@ -277,7 +294,10 @@ class CompGraphRunner(TokenMapping):
             tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
             return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        total_ns = perf_counter_ns() - start_ns
+        if total_ns > self._executor.short_ns:
+            hparams.repeated = None
+        times = program, wanted, durations_ns, total_ns, False, -1
         # Without targets everything is up to date then.
         left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
         run.record = values, left_dirty, True, revisions, hparams, times, None
@@ -290,6 +310,8 @@ class CompGraphRunner(TokenMapping):
             return run
         with self._lock:
             self.last = run
+            if program.states:
+                self._kept = run.state_after()
         self._keep_times(times)
         if self._watchers:
             self._tell_watchers()
@@ -324,9 +346,11 @@ class CompGraphRunner(TokenMapping):
         if trial_of is not None:
             run.trial_of = trial_of
             return run
+        *_, times, failure = run.record
         with self._lock:
             self.last = run
-        *_, times, failure = run.record
+            if self._program.states and failure is None:
+                self._kept = run.state_after()
         self.reports.add(times)
         if self._watchers:
             self._tell_watchers()
@@ -341,7 +365,14 @@ class CompGraphRunner(TokenMapping):
         run = None if last is None else last()
         return run if run is not None and run.failure is not None and run.failure.exception is exception else None
 
-    def trial(self, values: Mapping[str, Any], /, *targets: str, payload: Mapping[str, Any] | None = None) -> Run:
+    def trial(
+        self,
+        values: Mapping[str, Any],
+        /,
+        *targets: str,
+        payload: Mapping[str, Any] | None = None,
+        state: Mapping[str, Any] | None = None,
+    ) -> Run:
         """Run with other hyperparameters, or on another payload, and leave the runner as it is.
 
         Parameters
@@ -352,6 +383,9 @@ class CompGraphRunner(TokenMapping):
             Tokens; only what they need is run, everything without.
         payload
             The free source tokens by name, which count as new; without, all that is not stale in the last run is used.
+        state
+            With a payload, the state that the run begins with, such as that of the trial before: ``run.state``. What is
+            not in it, all of it without, is the runner's.
 
         Returns
         -------
@@ -364,12 +398,15 @@ class CompGraphRunner(TokenMapping):
             As ``rerun`` and ``run`` do.
         """
         if payload is None:
+            if state is not None:
+                raise PayloadError(self.free_source_tokens, "A trial with a state needs a payload: payload={...}.")
             return self._go_on(values, targets, True)
         start_ns = perf_counter_ns()
         before, last = self._state
         hparams = before.frozen(values, also_new=False)
         trial_of = self._key, before, None if last is None else ref(last)
-        return self._run_from_scratch(hparams, payload, targets, start_ns, trial_of)
+        begin = None if state is None else self._state_of(state)
+        return self._run_from_scratch(hparams, payload, targets, start_ns, trial_of, begin)
 
     def adopt(self, run: Run, /) -> bool:
         """Make a run of ``trial`` the last one and its hyperparameters the runner's, in one step.
@@ -388,6 +425,8 @@ class CompGraphRunner(TokenMapping):
             if before is not self._hparams or (None if last is None else last()) is not self.last:
                 return False
             self._hparams, self.last = run.record[4], run
+            if self._program.states and run.failure is None:
+                self._kept = run.state_after()
         self.reports.add(run.record[5])
         self._tell_watchers()
         return True
@@ -481,6 +520,55 @@ class CompGraphRunner(TokenMapping):
             self._hparams = self._hparams.frozen(values, also_new=also_new)
         self._tell_watchers()
 
+    # -- state --------------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """What the next run begins with, by delayed token (``ep.delay``): a snapshot, arrays read-only.
+
+        Of a nested pipeline the keys are ``"function.token"``. Set it, or some of its keys, to go on from there.
+        """
+        states, kept = self._program.states, self._kept
+        return MappingProxyType(
+            {slots.key: lend(value) if self.guard else value for slots, value in zip(states, kept, strict=True)}
+        )
+
+    @state.setter
+    def state(self, values: Mapping[str, Any]) -> None:
+        kept = self._state_of(values)
+        with self._series, self._lock:
+            self._kept = kept
+        self._tell_watchers()
+
+    def reset(self) -> None:
+        """Have the next run begin with the initial state; the last run stays, and ``rerun`` repeats it as it was."""
+        with self._series, self._lock:
+            self._kept = self._initial_state()
+        self._tell_watchers()
+
+    def _initial_state(self) -> tuple[Any, ...]:
+        return tuple(slots.initial for slots in self._program.states)
+
+    def _state_of(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return a state as it is stored; what is not among the values stays as it is.
+
+        Raises
+        ------
+        UnknownName
+            No token of this name is delayed.
+        """
+        require_mapping("state", values, "of delayed tokens to values")
+        program, kept = self._program, {slots.key: slots for slots in self._program.states}
+        for key in values:
+            if key not in kept:
+                raise UnknownName("delayed token", key, kept, "in this graph: see ep.delay")
+        return tuple(
+            (keep(values[slots.key], 0, program, slots.before, ()) if program.guard else values[slots.key])
+            if slots.key in values
+            else now
+            for slots, now in zip(program.states, self._kept, strict=True)
+        )
+
     # -- reading ------------------------------------------------------------------------------------------------
 
     @property
@@ -505,7 +593,7 @@ class CompGraphRunner(TokenMapping):
         Both are given, so that what is read beside a rerun in another thread is decided from one state.
         """
         if last is None:
-            return TokenManager.from_scratch(self._program, hparams.base.copy(), not hparams.free_slots)
+            return self._beginning(hparams, {}, self._kept)
         if last.record[4] is hparams and not self._program.revised:
             return last.tokens
         tokens = last.tokens.branch()
@@ -587,9 +675,7 @@ def stop_at(
             return before
         tokens, durations_ns = before.tokens.branch(), dict(before.report.ran_ns)
     else:
-        values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
-        tokens = TokenManager.from_scratch(program, values, has_payload)
-        durations_ns = {}
+        tokens, durations_ns = runner._beginning(hparams, payload, runner._kept), {}
     wanted = bytes(len(program.steps))
     if function is None or why is None:
         times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1

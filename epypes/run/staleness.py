@@ -225,7 +225,7 @@ class TokenManager:
         return self.program.cg.has_token(token) and self.is_readable(token)
 
     def __iter__(self) -> Iterator[str]:
-        return (token for token in self.program.tokens if self.is_readable(token))
+        return (token for token in self.program.cg.tokens if self.is_readable(token))
 
 
 def is_same_value(old: Any, new: Any) -> bool:

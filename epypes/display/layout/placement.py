@@ -25,7 +25,11 @@ _MOST_VERTICES: Final = 1000
 
 @functools.lru_cache(maxsize=128)
 def lay_out(
-    boxes: tuple[Box, ...], edges: tuple[Edge, ...], is_dense: bool = False, direction: Direction = "down"
+    boxes: tuple[Box, ...],
+    edges: tuple[Edge, ...],
+    is_dense: bool = False,
+    direction: Direction = "down",
+    back: tuple[Edge, ...] = (),
 ) -> Layout:
     """Place vertices and edges.
 
@@ -38,6 +42,8 @@ def lay_out(
         search for few crossings would take Graphviz minutes.
     direction
         Where edges lead.
+    back
+        Edges that lead back, which no vertex is placed by; their splines come last. None in rows.
 
     Raises
     ------
@@ -45,8 +51,9 @@ def lay_out(
         No engine answered.
     """
     if direction == "down":
-        return _downwards(boxes, edges, is_dense)
-    layout = _downwards(tuple(Box(box.shape, box.height, box.width) for box in boxes), edges, is_dense)
+        return _with_back(_downwards(boxes, edges, is_dense), boxes, edges, back)
+    turned = tuple(Box(box.shape, box.height, box.width) for box in boxes)
+    layout = _with_back(_downwards(turned, edges, is_dense), turned, edges, back)
     return _moved(layout, lambda point: point[::-1], layout.height, layout.width)
 
 
@@ -155,6 +162,12 @@ def _with_arcs(layout: Layout, boxes: Sequence[Box], edges: Sequence[Edge], arcs
     routed = iter(layout.splines)
     splines = tuple(_arc(boxes, layout.centres, edge) if edge in arcs else next(routed) for edge in edges)
     return Layout(layout.width, layout.height, layout.centres, splines)
+
+
+def _with_back(layout: Layout, boxes: Sequence[Box], edges: Sequence[Edge], back: Collection[Edge]) -> Layout:
+    if not back or not layout.splines:
+        return layout
+    return _with_arcs(layout, boxes, (*edges, *back), back)
 
 
 def _bulge(start: Point, end: Point) -> float:

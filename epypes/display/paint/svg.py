@@ -23,11 +23,13 @@ from epypes.display.views.groups import function_count
 from epypes.wording import counted
 
 _OFF: Final = " off"
+# Here, not in the style, which every picture has.
+_BACK: Final = ' back" stroke-dasharray="6 3'
 
 
 @lru_cache(maxsize=128)
 def paint_edges(edges: tuple[EdgeView, ...], ends: tuple[Edge, ...], layout: Layout) -> str:
-    """Paint the edges, those that no run uses first and dashed.
+    """Paint the edges, those that no run uses first and dashed, those to the next run last.
 
     All of one kind are one path: a graph has many.
 
@@ -47,6 +49,8 @@ def paint_edges(edges: tuple[EdgeView, ...], ends: tuple[Edge, ...], layout: Lay
             painted.append(_paint_splines([layout.splines[place] for place in places], kind))
         elif places:
             painted.append(_paint_lines([ends[place] for place in places], layout, kind))
+    if len(layout.splines) > len(edges):
+        painted.append(_paint_splines(layout.splines[len(edges) :], _BACK))
     return "\n".join(painted)
 
 
@@ -151,7 +155,9 @@ def paint_svg(graph: GraphView) -> str:
         (functions + token, function) if is_input else (function, functions + token)
         for function, token, is_input, _ in graph.edges
     ])  # fmt: skip
-    layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction)
+    place = {token.name: functions + index for index, token in enumerate(graph.tokens)}
+    back = tuple((place[token], place[to]) for token, to in graph.delays if token in place and to in place)
+    layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction, back)
     around, bounds = paint_around(graph, layout)
     width, height = bounds.right - bounds.left + 2 * _MARGIN, bounds.bottom - bounds.top + 2 * _MARGIN
     size = f"{width:.0f}", f"{height:.0f}"

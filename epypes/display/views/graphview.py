@@ -132,6 +132,8 @@ class GraphView:
         What is inside the vertices of kind ``"group"``, by their names.
     direction
         Where the data flows to on the page.
+    delays
+        Pairs of a token and the one that has its value in the next run.
     """
 
     functions: tuple[FunctionView, ...]
@@ -143,6 +145,7 @@ class GraphView:
     after: tuple[StageView, ...] = ()
     groups: tuple[GroupView, ...] = ()
     direction: Direction = "down"
+    delays: tuple[tuple[str, str], ...] = ()
 
     @property
     def draws_edges(self) -> bool:

@@ -71,6 +71,7 @@ def _structure(cg: CompGraph, choices: _Choices) -> GraphView:
         tuple(_token_view(cg, token, choices, unread) for token in cg.tokens),
         tuple(_edges(cg, choices.left_out, unread)),
         _redefined_caption(choices.redefined),
+        delays=tuple((delay.token, previous) for previous, delay in cg.delays.items()),
     )
 
 
