@@ -17,7 +17,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 from warnings import warn
+from weakref import WeakKeyDictionary
 
+from epypes.acquisition.video import Video, VideoFrame
 from epypes.batch.cases import Case
 from epypes.batch.items import Item
 from epypes.batch.results import Outcome
@@ -114,7 +116,10 @@ def reader_text(name: str) -> str:
 
 
 def payload_digest(payload: Mapping[str, Any]) -> str:
-    """Return the digest of a payload: of every token the file's content, wherever it is, or the value.
+    """Return the digest of a payload: of every token the content of the file, wherever it is, or the value.
+
+    Of a frame of a video it is the content of the video with the number of the frame, so that what is stored is found
+    without decoding.
 
     Raises
     ------
@@ -123,11 +128,27 @@ def payload_digest(payload: Mapping[str, Any]) -> str:
     """
     parts: list[str] = []
     for token, value in sorted(payload.items()):
-        digest = file_digest(value) if isinstance(value, Path) else value_digest(value)
+        if isinstance(value, VideoFrame):
+            digest = _frame_digest(value)
+        else:
+            digest = file_digest(value) if isinstance(value, Path) else value_digest(value)
         if not digest:
             raise NoDigest(f"{str(value)!r}, which can't be read")
         parts += token, digest
     return combined_digest("payload", *parts).hex()
+
+
+# Of videos that are open, since each of their frames asks for it.
+_VIDEO_DIGESTS: Final[WeakKeyDictionary[Video, str]] = WeakKeyDictionary()
+
+
+def _frame_digest(frame: VideoFrame) -> str:
+    video = frame.video
+    if video not in _VIDEO_DIGESTS:
+        video.require_unchanged()
+        _VIDEO_DIGESTS[video] = file_digest(video.path)
+    file = _VIDEO_DIGESTS[video]
+    return combined_digest("frame", file, str(frame.number)).hex() if file else ""
 
 
 def value_label(value: Any) -> str:

@@ -24,8 +24,9 @@ A check is a metric, of one token or of the whole run, with its bounds. The file
     max = 300
 
 A text that ends like the name of an image, of ``.npy`` or of ``.npz`` is a file, whose path is relative to that of the
-cases; other texts and numbers stand for themselves. The metrics are ``equal``, ``close`` (``atol``, ``rtol``), ``iou``
-(``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
+cases; other texts and numbers stand for themselves. So is a text in ``inputs`` that ends like the name of a video: each
+of its frames is a case of its own, with the same checks. The metrics are ``equal``, ``close`` (``atol``, ``rtol``),
+``iou`` (``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
 ``epypes.batch.metrics``, whose options stand beside ``min`` and ``max``. Of label images, integers with more than one
 value besides 0, ``iou`` is the mean over the objects, paired one with one; one that is left over on either side counts
 0. A check may have a ``name``. A case without a check passes if it runs.
@@ -37,12 +38,14 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, read_value
+from epypes.acquisition.files import is_video_name
+from epypes.acquisition.video import Video, VideoFrame
+from epypes.batch.items import by_frame, defensive_copy, holds_its_arrays, is_file, read_value
 from epypes.batch.metrics import METRICS
 from epypes.bundle.settings import decode_value
 from epypes.errors import EpypesError, ScaleError, UnknownName
@@ -108,7 +111,8 @@ class Case:
     ----------
     inputs
         By free source token: a value, or the path of its file; a text is a path if it ends like an image, ``.npy`` or
-        ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token.
+        ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token. A video, or
+        the path of one, stands for a case per frame, each with the same checks.
     expected
         By token: the value that it must have, or the path of a file that holds it (an image, ``.npy`` or ``.npz``);
         a text with such an ending is a path. Where no function and no metric that compares looks at a token, it must
@@ -188,14 +192,19 @@ def cases_of(given: Any) -> tuple[Case, ...]:
     Parameters
     ----------
     given
-        The path of a CASES.toml, or an iterable of cases, of dicts with a case's parts, or of inputs alone.
+        The path of a CASES.toml; an iterable of cases, of dicts with a case's parts, or of inputs alone; or a video, or
+        the path of one, of which each frame is a case. A case with a video becomes one per frame.
 
     Raises
     ------
     ScaleError
         There is none, or one is not a case.
+    ImageFileError
+        A video can't be opened.
     """
-    if isinstance(given, str | os.PathLike):
+    if isinstance(given, Video) or (isinstance(given, str | os.PathLike) and is_video_name(Path(given))):
+        found = [Case(given)]
+    elif isinstance(given, str | os.PathLike):
         found = _read_file(Path(given))
     elif isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(
@@ -205,11 +214,22 @@ def cases_of(given: Any) -> tuple[Case, ...]:
         found = [_case(item) if holds_its_arrays(given) else _copied(_case(item)) for item in given]
     if not found:
         raise ScaleError("There are no cases. Give at least one: ep.Case(inputs, expected={...}).")
+    found = [one for case in found for one in _by_frame(case)]
     taken: dict[str, int] = {}
     return tuple(
         replace(case, name=_unique(case.name or _file_name(case.inputs) or f"#{number}", taken))
         for number, case in enumerate(found)
     )
+
+
+def _by_frame(case: Case) -> Iterator[Case]:
+    """Yield a case, or, of one with a video, a case for each frame."""
+    for inputs in by_frame(case.inputs):
+        if inputs is case.inputs:
+            yield case
+        else:
+            frame = next(value for value in _values(inputs) if isinstance(value, VideoFrame))
+            yield replace(case, inputs=inputs, name=f"{case.name} #{frame.number}" if case.name else frame.name)
 
 
 def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:
@@ -262,8 +282,11 @@ def _copied(case: Case) -> Case:
 
 
 def _file_name(inputs: Any) -> str:
-    values = inputs.values() if isinstance(inputs, Mapping) else (inputs,)
-    return next((PurePath(value).name for value in values if is_file(value)), "")
+    return next((PurePath(value).name for value in _values(inputs) if is_file(value)), "")
+
+
+def _values(inputs: Any) -> Iterable[Any]:
+    return inputs.values() if isinstance(inputs, Mapping) else (inputs,)
 
 
 def _unique(name: str, taken: dict[str, int]) -> str:
@@ -446,14 +469,15 @@ def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
     values = table.get("hyperparameters")
     if isinstance(values, Mapping):
         values = {token: _hyperparameter(token, entry) for token, entry in values.items()}
-    return Case(_in_folder(table["inputs"], folder), expected, metrics, name, values)
+    return Case(_in_folder(table["inputs"], folder, has_videos=True), expected, metrics, name, values)
 
 
-def _in_folder(value: Any, folder: Path) -> Any:
+def _in_folder(value: Any, folder: Path, *, has_videos: bool = False) -> Any:
     """Return the path of what names a file, relative to that of the cases, by token too; any other value as it is."""
     if isinstance(value, Mapping):
-        return {token: _in_folder(item, folder) for token, item in value.items()}
-    return folder / Path(value).expanduser() if is_file(value) else value
+        return {token: _in_folder(item, folder, has_videos=has_videos) for token, item in value.items()}
+    names_video = has_videos and isinstance(value, str) and is_video_name(Path(value))
+    return folder / Path(value).expanduser() if names_video or is_file(value) else value
 
 
 def _hyperparameter(token: str, entry: Any) -> Any:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 from typing import Any, Final
 
-from epypes.batch.items import Item, payload_of
+from epypes.acquisition.video import VideoFrame
+from epypes.batch.items import Item, payload_of, read_value
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
 from epypes.errors import EpypesError
+from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.run.runner import branched
 
@@ -92,7 +94,34 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
 
 def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorInfo) -> list[Outcome]:
     """Return the outcomes of an item that could not be run, for each of its settings."""
-    return [Outcome(item.number, item.name, setting, error_info=error_info) for setting in settings]
+    return [_blank(item, setting, error_info) for setting in settings]
+
+
+def read_frames(job: Job, cg: CompGraph) -> Job:
+    """Return a job with the pixels of its frames of a video, for an executor: this thread decodes them, in order.
+
+    So a video is decoded once, without seeking, and worker processes need neither the file nor its codec.
+
+    Raises
+    ------
+    ImageFileError
+        A frame is damaged.
+    """
+    payload = job.item.payload
+    if not any(isinstance(value, VideoFrame) for value in payload.values()):
+        return job
+    read = {
+        token: read_value(value, cg, token) if isinstance(value, VideoFrame) else value
+        for token, value in payload.items()
+    }
+    return replace(job, item=replace(job.item, payload=read))
+
+
+def _blank(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
+    """Return the outcome of an item that has no values."""
+    return Outcome(
+        item.number, item.name, setting, total_ns=total_ns, error_info=error_info, frame=item.frame, time_s=item.time_s
+    )
 
 
 def _outcome(
@@ -116,7 +145,7 @@ def _outcome(
     except (Exception, SystemExit) as error:  # whatever a function raises
         if runner.last is None or runner.last is before:
             info = ErrorInfo("", type(error).__name__, str(error))
-            return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, error_info=info)
+            return _blank(item, setting, info, perf_counter_ns() - start_ns)
         run = runner.last
     report, tokens, failure = run.report, run.tokens, run.failure
     sinks = [token for token in run.cg.sink_tokens if tokens.is_readable(token)]
@@ -133,6 +162,8 @@ def _outcome(
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
         tuple(filter(tokens.is_nothing, sinks)),
+        item.frame,
+        item.time_s,
     )
 
 

@@ -13,10 +13,10 @@ from epypes.batch.cache import outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
-from epypes.batch.items import Item, count_of, detached_runner, items_of
+from epypes.batch.items import Item, count_of, detached_runner, image_set, items_of
 from epypes.batch.job import NO_SETTING, Job, SharedStart
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import FIXED_COLUMNS, Outcome, OutcomeSequence, outcomes_frame, outcomes_html
+from epypes.batch.results import Outcome, OutcomeSequence, fixed_columns, outcomes_frame, outcomes_html
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -52,6 +52,7 @@ class MapResult(OutcomeSequence):
     def to_frame(self) -> pd.DataFrame:
         """Return a table: name, failure, the sink tokens, total_ms, and the time of each function in ms.
 
+        Of frames of a video it has frame and time_s after name: the number, from 0, and the time since the first frame.
         Sink tokens that are no numbers, texts or truth values stand there as a short text.
         """
         return outcomes_frame(self.outcomes, self.cg)
@@ -91,10 +92,9 @@ class SweepResult(OutcomeSequence):
         Its columns are name, the hyperparameters that were varied, failure (None, or what failed), the sink tokens,
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
+        taken = fixed_columns(self.outcomes)
         varied = {
-            f"{name} (hyperparameter)" if name in FIXED_COLUMNS else name: [
-                one.setting.get(name) for one in self.outcomes
-            ]
+            f"{name} (hyperparameter)" if name in taken else name: [one.setting.get(name) for one in self.outcomes]
             for name in self.names
         }
         return outcomes_frame(self.outcomes, self.runner.cg, varied)
@@ -150,9 +150,10 @@ def map_images(
     runner
         Its graph and hyperparameters are used.
     images
-        A folder, a glob, or an iterable of images, paths of image files, or dicts by free source token; read when
-        their turn comes, so that they may be more than fit into memory. A generator may fill one array again and again.
-        In a dict a text stands for itself, unless it has the ending of an image and there is such a file.
+        A folder, a glob, a video (its path, or ``ep.video(path)``), or an iterable of images, frames of ``ep.camera``,
+        paths of image files and videos, or dicts by free source token; read when their turn comes, so that they may be
+        more than fit into memory. A generator may fill one array again and again. In a dict a text stands for itself,
+        unless it has the ending of an image or a video and there is such a file.
     executor
         None: this thread runs the images. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the
@@ -181,12 +182,15 @@ def map_images(
     Returns
     -------
     MapResult
-        One outcome per image, in order. An image that can't be read or on which a function fails is one with its error.
+        One outcome per image, in order; of a video one per frame, with its number and time. An image that can't be
+        read, a frame that is damaged, and what a function fails on is one with its error.
 
     Raises
     ------
     ScaleError
         The set is empty; an item does not give the free source tokens; the graph or a value can't travel.
+    ImageFileError
+        A video can't be opened; nothing is run then.
     ExecutorBroken
         The executor can't go on.
     PromotionRefused
@@ -340,6 +344,7 @@ def run_items(
     in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
+    images = image_set(images)
     count = count_of(images)
     if kind == "sweep":
         _require_room(runner, settings, shown, count or 1)

@@ -86,6 +86,8 @@ class Outcome:
         Of tokens whose thumbnails were asked for and that have no picture: a text instead.
     nothing
         The sink tokens whose value is Nothing; their cells of a table are empty.
+    frame, time_s
+        Of a frame of a video or a camera, its number, from 0, and its time in s since the first one; else None.
     """
 
     number: int
@@ -99,6 +101,8 @@ class Outcome:
     kept: Mapping[str, Any] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
     nothing: tuple[str, ...] = ()
+    frame: int | None = None
+    time_s: float | None = None
 
     @property
     def has_failed(self) -> bool:
@@ -123,7 +127,8 @@ class Outcome:
         }
         error_info = None if info is None else ErrorInfo(**info)
         found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting)
-        return replace(found, error_info=error_info, thumbnails=thumbnails, nothing=tuple(found.nothing))
+        found = replace(found, error_info=error_info, thumbnails=thumbnails, nothing=tuple(found.nothing))
+        return replace(found, frame=item.frame, time_s=item.time_s)
 
 
 class OutcomeSequence(Sequence[Outcome]):
@@ -171,7 +176,18 @@ def _scalar(value: Any) -> Any:
     return item if isinstance(item, bool | int | float) else value
 
 
-FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
+_FRAME_COLUMNS: Final = ("frame", "time_s")
+
+
+def fixed_columns(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+    """Return the names of the columns that a table of outcomes has in any case."""
+    return ("name", *_frame_columns(outcomes), "failure", "total_ms")
+
+
+def _frame_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
+    """Return the columns of frames, where any outcome is one, and of times, where any has one."""
+    columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in _FRAME_COLUMNS}
+    return {name: values for name, values in columns.items() if any(value is not None for value in values)}
 
 
 def outcomes_frame(
@@ -191,17 +207,20 @@ def outcomes_frame(
     Returns
     -------
     pandas.DataFrame
-        ``name``, the extra columns, ``failure`` (None, or what failed), one column per sink token, ``total_ms``, and
-        ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
+        ``name``, of frames ``frame`` and ``time_s``, the extra columns, ``failure`` (None, or what failed), one column
+        per sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token that is called like another column
+        has `` (token)`` after its name.
         Where nothing was found, or the run failed, the cell of the token is empty: None, NaN or NA.
     """
+    fixed = fixed_columns(outcomes)
     columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
+    columns |= {column: _column(values) for column, values in _frame_columns(outcomes).items()}
     columns |= {column: object_column(values) for column, values in extra.items()}
     columns["failure"] = object_column(
         [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
     )
     for token in cg.sink_tokens:
-        is_taken = token in columns or token in FIXED_COLUMNS
+        is_taken = token in columns or token in fixed
         columns[f"{token} (token)" if is_taken else token] = _column(
             [outcome.values.get(token) for outcome in outcomes]
         )
@@ -305,9 +324,11 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in outcomes)]
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
+    has_times = "time_s" in _frame_columns(outcomes)
     rows = [
         [
             outcome.name,
+            *([] if not has_times else ["" if outcome.time_s is None else f"{outcome.time_s:.3f} s"]),
             *(outcome.thumbnails.get(token) for token in shown),
             *(_cell_text(outcome, token) for token in sinks),
             duration_text(outcome.total_ns),
@@ -315,7 +336,8 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
         for outcome in outcomes
     ]
     failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
-    return html_table(caption, ["name", *shown, *sinks, "time"], rows, failures)
+    times = ["time of the frame"] if has_times else []
+    return html_table(caption, ["name", *times, *shown, *sinks, "time"], rows, failures)
 
 
 def _cell_text(outcome: Outcome, token: str) -> str:
