@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 from typing import Any, Final
 
-from epypes.batch.items import Item, payload_of
+from epypes.batch.items import Item, frames_of, payload_of
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
 from epypes.errors import EpypesError
-from epypes.run import CompGraphRunner
+from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
 
 Setting = Mapping[str, Any]
+State = Mapping[str, Any]
 # One object, since settings are compared by identity.
 NO_SETTING: Final[Setting] = {}
 
@@ -38,6 +39,8 @@ class Job:
         The first run of the item, which several jobs share in this process; None for one of its own.
     targets
         Tokens; only what they need is run, branches that are not chosen too. Everything without.
+    states
+        Of a graph with state, what the item begins with, by setting; the initial state without.
     """
 
     item: Item
@@ -46,6 +49,7 @@ class Job:
     show: tuple[str, ...] | None = ()
     start: SharedStart | None = None
     targets: tuple[str, ...] = ()
+    states: tuple[State, ...] = ()
 
 
 def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
@@ -56,8 +60,38 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     runner
         One that no other thread uses; it has its hyperparameters again afterwards.
     job
-        The item and its settings. Of the second setting on only what depends on what changed is run.
+        The item and its settings. Of the second setting on only what depends on what changed is run, unless the graph
+        has state between runs.
     """
+    return _run_with_state(runner, job) if runner.state else _run_without_state(runner, job)
+
+
+def _run_with_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
+    """Run the item, or its frames one after another, from the beginning for each setting; give the last outcomes."""
+    for place, setting in enumerate(job.settings):
+        yield _outcome_with_state(runner, job, setting, job.states[place] if job.states else {})
+
+
+def _outcome_with_state(runner: CompGraphRunner, job: Job, setting: Setting, state: State) -> Outcome:
+    item, total_ns, last = job.item, 0, None
+    try:
+        for place, frame in enumerate(frames_of(item, runner)):
+            start_ns = perf_counter_ns()
+            last = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
+            total_ns += perf_counter_ns() - start_ns if item.frames is not None else last.report.total_ns
+            state = last.state
+            if last.failure is not None:
+                where = "" if item.frames is None else f" (frame {place}: {frame.name})"
+                return _outcome_of(last, job, setting, Album(), total_ns, where)
+    except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
+        (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
+        return replace(failed, state=state)
+    if last is None:
+        raise AssertionError("an item has a frame at least")
+    return _outcome_of(last, job, setting, Album(), total_ns)
+
+
+def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     item, start, now = job.item, job.start or SharedStart(), runner.hyperparameters
     # A setting may leave out what another one has: that is then as it was.
     varied = {token: now[token] for setting in job.settings for token in setting if token in now}
@@ -92,7 +126,7 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
 
 def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorInfo) -> list[Outcome]:
     """Return the outcomes of an item that could not be run, for each of its settings."""
-    return [Outcome(item.number, item.name, setting, error_info=error_info) for setting in settings]
+    return [Outcome(item.number, item.name, setting, error_info=error_info, series=item.series) for setting in settings]
 
 
 def _outcome(
@@ -115,10 +149,15 @@ def _outcome(
             run = runner.run_on(payload, job.targets)
     except (Exception, SystemExit) as error:  # whatever a function raises
         if runner.last is None or runner.last is before:
-            info = ErrorInfo("", type(error).__name__, str(error))
-            return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, error_info=info)
+            (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
+            return replace(failed, total_ns=perf_counter_ns() - start_ns)
         run = runner.last
-    report, tokens, failure = run.report, run.tokens, run.failure
+    return _outcome_of(run, job, setting, album, run.report.total_ns)
+
+
+def _outcome_of(run: Run, job: Job, setting: Setting, album: Album, total_ns: int, where: str = "") -> Outcome:
+    """Return the outcome of a run; ``where`` it failed is added to the message."""
+    item, report, tokens, failure = job.item, run.report, run.tokens, run.failure
     thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
         item.number,
@@ -126,11 +165,13 @@ def _outcome(
         setting,
         {token: short_value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
         report.durations_ns,
-        report.total_ns,
-        None if failure is None else ErrorInfo(failure.function, failure.kind, failure.message),
+        total_ns,
+        None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
+        item.series,
+        run.state,
     )
 
 

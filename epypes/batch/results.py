@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 # What reading a file raises.
 _UNREADABLE: Final = frozenset({ImageFileError.__name__, ScaleError.__name__})
+_NOT_STORED: Final = frozenset({"kept", "series", "state"})
 # Python can be configured to refuse numbers of more than 640 digits.
 _MOST_BITS: Final = 2_126
 
@@ -82,6 +83,10 @@ class Outcome:
         Whole values by token, if they were asked for.
     texts
         Of tokens whose thumbnails were asked for and that have no picture: a text instead.
+    series
+        The key of the item's series.
+    state
+        Of a graph with state, what the next item of the series begins with; a map does not keep it.
     """
 
     number: int
@@ -94,6 +99,8 @@ class Outcome:
     thumbnails: Mapping[str, Thumbnail] = field(default_factory=dict)
     kept: Mapping[str, Any] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
+    series: Any = None
+    state: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def has_failed(self) -> bool:
@@ -101,12 +108,12 @@ class Outcome:
         return self.error_info is not None
 
     def to_json(self) -> dict[str, Any]:
-        """Return all but ``kept`` as JSON can hold it."""
+        """Return all but ``kept`` and the series as JSON can hold it."""
         setting = {token: short_value(value) for token, value in self.setting.items()}
-        data = asdict(replace(self, setting=setting, times_ns=dict(self.times_ns), kept={}))
+        data = asdict(replace(self, setting=setting, times_ns=dict(self.times_ns), kept={}, series=None, state={}))
         for shown in data["thumbnails"].values():
             shown["data"] = base64.b64encode(shown["data"]).decode()
-        return {name: part for name, part in data.items() if name != "kept"}
+        return {name: part for name, part in data.items() if name not in _NOT_STORED}
 
     @staticmethod
     def from_json(data: Mapping[str, Any], item: Item, setting: Mapping[str, Any]) -> Outcome:
@@ -117,7 +124,7 @@ class Outcome:
             for token, shown in data["thumbnails"].items()
         }
         error_info = None if info is None else ErrorInfo(**info)
-        found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting)
+        found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting, series=item.series)
         return replace(found, error_info=error_info, thumbnails=thumbnails)
 
 
@@ -181,16 +188,21 @@ def outcomes_frame(
     cg
         The graph, which gives the order of sink tokens and functions.
     extra
-        Columns by name, each with a value per outcome; they stand after ``name``.
+        Columns of hyperparameters by name, each with a value per outcome; they stand after ``name``.
 
     Returns
     -------
     pandas.DataFrame
-        ``name``, the extra columns, ``failure`` (None, or what failed), one column per sink token, ``total_ms``, and
-        ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
+        ``name``, ``series`` if there are some, the extra columns, ``failure`` (None, or what failed), one column per
+        sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token that is called like another column has
+        `` (token)`` after its name.
     """
     columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= {column: object_column(values) for column, values in extra.items()}
+    if has_series(outcomes):
+        columns["series"] = object_column([outcome.series for outcome in outcomes])
+    for column, values in extra.items():
+        is_taken = column in columns or column in FIXED_COLUMNS
+        columns[f"{column} (hyperparameter)" if is_taken else column] = object_column(values)
     columns["failure"] = object_column(
         [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
     )
@@ -203,6 +215,11 @@ def outcomes_frame(
     for function in cg.functions:
         columns[f"{function} ms"] = [outcome.times_ns.get(function, math.nan) / 1e6 for outcome in outcomes]
     return frame_of(columns)
+
+
+def has_series(outcomes: Sequence[Outcome]) -> bool:
+    """Whether outcomes are of series that have keys."""
+    return any(outcome.series is not None for outcome in outcomes)
 
 
 def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
@@ -297,11 +314,13 @@ def _html_cell(cell: HtmlCell, what: str) -> str:
 def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
     """Return a table of outcomes as HTML, with their thumbnails."""
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in outcomes)]
+    of_series = has_series(outcomes)
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
     rows = [
         [
             outcome.name,
+            *([value_text(outcome.series)] if of_series else []),
             *(outcome.thumbnails.get(token) for token in shown),
             *(value_text(outcome.values[token]) if token in outcome.values else "" for token in sinks),
             duration_text(outcome.total_ns),
@@ -309,7 +328,8 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
         for outcome in outcomes
     ]
     failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
-    return html_table(caption, ["name", *shown, *sinks, "time"], rows, failures)
+    head = ["name", *(["series"] if of_series else []), *shown, *sinks, "time"]
+    return html_table(caption, head, rows, failures)
 
 
 def value_text(value: Any) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -92,9 +92,17 @@ class Run(TokenMapping):
     @property
     def state(self) -> Mapping[str, Any]:
         """What the next run begins with, by delayed token; see ``ep.delay``. Of a failed run, what it began with."""
+        return self._lent_state(self.state_after())
+
+    @property
+    def state_before(self) -> Mapping[str, Any]:
+        """What the run began with, by delayed token: a trial with this state repeats it."""
+        return self._lent_state([self.record[0][slots.before] for slots in self.record[4].program.states])
+
+    def _lent_state(self, values: Sequence[Any]) -> Mapping[str, Any]:
         states, guard = self.record[4].program.states, self.record[4].program.guard
-        values = zip(states, self.state_after(), strict=True)
-        known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
+        pairs = zip(states, values, strict=True)
+        known = {slots.key: value for slots, value in pairs if value is not NOT_COMPUTED}
         return MappingProxyType({key: lend(value) if guard else value for key, value in known.items()})
 
     def state_after(self) -> tuple[Any, ...]:
