@@ -183,7 +183,7 @@ class CompGraphRunner(TokenMapping):
         trial_of: TrialOf | None,
         state: Sequence[Any] | None = None,
     ) -> Run:
-        """Run what the targets need, everything without, on a payload and a state: the runner's own if none is given."""
+        """Run what the targets need, everything without, on a payload and a state, the runner's own without."""
         self._require_targets(targets)
         tokens = self._beginning(hparams, payload, self._kept if state is None else state)
         try:
