@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -92,18 +92,17 @@ class Run(TokenMapping):
     @property
     def state(self) -> Mapping[str, Any]:
         """What the next run begins with, by delayed token; see ``ep.delay``. Of a failed run, what it began with."""
-        return self._lent_state(self.state_after())
+        states, guard = self.record[4].program.states, self.record[4].program.guard
+        values = zip(states, self.state_after(), strict=True)
+        known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
+        return MappingProxyType({key: lend(value) if guard else value for key, value in known.items()})
 
     @property
     def state_before(self) -> Mapping[str, Any]:
-        """What the run began with, by delayed token: a trial with this state repeats it."""
-        return self._lent_state([self.record[0][slots.before] for slots in self.record[4].program.states])
-
-    def _lent_state(self, values: Sequence[Any]) -> Mapping[str, Any]:
-        states, guard = self.record[4].program.states, self.record[4].program.guard
-        pairs = zip(states, values, strict=True)
-        known = {slots.key: value for slots, value in pairs if value is not NOT_COMPUTED}
-        return MappingProxyType({key: lend(value) if guard else value for key, value in known.items()})
+        """What the run began with, by delayed token; ``runner.trial`` takes it to repeat the run on its payload."""
+        values, program = self.record[0], self.record[4].program
+        known = {slots.key: values[slots.before] for slots in program.states}
+        return MappingProxyType({key: lend(value) if program.guard else value for key, value in known.items()})
 
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
