@@ -395,7 +395,9 @@ def tune(
         has returned: then the picture follows the service's own events, values are set there, with their revision, and
         what other clients set at the same time is never overwritten unseen.
     images
-        Test images to switch between: values of the one free source token, or dicts by token. A service has none.
+        Test images to switch between: values of the one free source token, or dicts by token. A service has none. Of a
+        graph with state (``ep.delay``) they are the frames of a sequence: each is shown with the state that runs over
+        all frames before it leave, with the same hyperparameters.
     cases
         A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
         shows whether it passes with the values that were committed last. A service has none.
@@ -459,6 +461,7 @@ def tune(
         runner.cg.require_token(token)
     found = read_cases(runner, images, cases)
     given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
+    has_state = isinstance(runner, CompGraphRunner) and bool(runner.state)
     session = Session(runner, given)
     if session.is_service and given:
         runner.trial({}, payload=given[0].values)  # refuses it
@@ -467,7 +470,8 @@ def tune(
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
     control_set = ControlSet(controls(runner, hints))
-    looked_at: list[Any] | None = [case for case, _ in found] or [payload.values for payload in given] or None
+    frames = [payload.values for payload in given]
+    looked_at: list[Any] | None = [case for case, _ in found] or ([frames] if has_state and frames else frames) or None
     search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
     session.begin()
     return Panel(control_set, session, token, found, store, name, search)
