@@ -36,6 +36,8 @@ class TokenView(NamedTuple):
         That of its colours.
     first
         The text of the first value of a hyperparameter that has another one now; empty for all other tokens.
+    delayed
+        The token whose value in the run before it has; empty for all other tokens.
     """
 
     name: str
@@ -44,6 +46,7 @@ class TokenView(NamedTuple):
     preview: Preview | None = None
     order: Order = "bgr"
     first: str = ""
+    delayed: str = ""
 
 
 class FunctionView(NamedTuple):

@@ -14,7 +14,14 @@ from weakref import WeakKeyDictionary
 from epypes.display.previews.preview import preview
 from epypes.display.previews.short import without_addresses
 from epypes.display.text import cut
-from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
+from epypes.display.views.graphview import (
+    EdgeView,
+    FunctionState,
+    FunctionView,
+    GraphView,
+    TokenState,
+    TokenView,
+)
 from epypes.graph import (
     CompGraph,
     Switch,
@@ -117,7 +124,9 @@ def _token_view(cg: CompGraph, token: str, choices: _Choices, unread: Mapping[st
     else:
         consumers = cg.digraph.consumers[token]
         is_left_out = all(name in left_out or (name in branches and token in unread[name]) for name in consumers)
-    return TokenView(token, "payload", "left out" if is_left_out else "static", order=colour_order(cg, token))
+    delayed = cg.delays[token].token if token in cg.delays else ""
+    state: TokenState = "left out" if is_left_out else "static"
+    return TokenView(token, "payload", state, order=colour_order(cg, token), delayed=delayed)
 
 
 def _edges(cg: CompGraph, left_out: Collection[str], unread: Mapping[str, frozenset[str]]) -> Iterator[EdgeView]:

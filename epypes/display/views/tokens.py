@@ -107,7 +107,7 @@ def token_views(
         name, is_hyperparameter = token.name, token.name in hparams.values
         state = token.state if token.state == "left out" else "fresh" if is_hyperparameter else state_of(name)
         role = "hyperparameter" if is_hyperparameter else token.role
-        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""))
+        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""), token.delayed)
 
     return tuple(map(view, structure.tokens)), dropped
 
