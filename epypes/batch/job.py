@@ -11,7 +11,7 @@ from typing import Any, Final
 from epypes.batch.items import Item, frames_of, payload_of
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, ScaleError
 from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
 
@@ -40,7 +40,7 @@ class Job:
     targets
         Tokens; only what they need is run, branches that are not chosen too. Everything without.
     states
-        Of a graph with state, what the item begins with, by setting; the initial state without.
+        Of a graph with state, what the item begins with, by setting; frames begin with the initial state without.
     """
 
     item: Item
@@ -63,7 +63,8 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
         The item and its settings. Of the second setting on only what depends on what changed is run, unless the graph
         has state between runs.
     """
-    return _run_with_state(runner, job) if runner.state else _run_without_state(runner, job)
+    has_state = job.states or job.item.frames is not None
+    return _run_with_state(runner, job) if has_state else _run_without_state(runner, job)
 
 
 def _run_with_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
@@ -76,19 +77,18 @@ def _outcome_with_state(runner: CompGraphRunner, job: Job, setting: Setting, sta
     item, total_ns, last = job.item, 0, None
     try:
         for place, frame in enumerate(frames_of(item, runner)):
-            start_ns = perf_counter_ns()
             last = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
-            total_ns += perf_counter_ns() - start_ns if item.frames is not None else last.report.total_ns
+            total_ns += last.report.total_ns
             state = last.state
             if last.failure is not None:
                 where = "" if item.frames is None else f" (frame {place}: {frame.name})"
-                return _outcome_of(last, job, setting, Album(), total_ns, where)
+                return _outcome_of(last, job, setting, Album(), total_ns, state, where)
+        if last is None:
+            raise ScaleError(f"{item.name} has no frames. Give one at least.")
     except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
         (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
         return replace(failed, state=state)
-    if last is None:
-        raise AssertionError("an item has a frame at least")
-    return _outcome_of(last, job, setting, Album(), total_ns)
+    return _outcome_of(last, job, setting, Album(), total_ns, state)
 
 
 def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
@@ -152,11 +152,23 @@ def _outcome(
             (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
             return replace(failed, total_ns=perf_counter_ns() - start_ns)
         run = runner.last
-    return _outcome_of(run, job, setting, album, run.report.total_ns)
+    return _outcome_of(run, job, setting, album)
 
 
-def _outcome_of(run: Run, job: Job, setting: Setting, album: Album, total_ns: int, where: str = "") -> Outcome:
-    """Return the outcome of a run; ``where`` it failed is added to the message."""
+def _outcome_of(
+    run: Run, job: Job, setting: Setting, album: Album, total_ns: int = 0, state: State = NO_SETTING, where: str = ""
+) -> Outcome:
+    """Return the outcome of a run.
+
+    Parameters
+    ----------
+    total_ns
+        Of the runs before it too; 0: its own.
+    state
+        What it has left.
+    where
+        Is added to the message of a failure.
+    """
     item, report, tokens, failure = job.item, run.report, run.tokens, run.failure
     thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
@@ -165,13 +177,13 @@ def _outcome_of(run: Run, job: Job, setting: Setting, album: Album, total_ns: in
         setting,
         {token: short_value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
         report.durations_ns,
-        total_ns,
+        total_ns or report.total_ns,
         None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
         item.series,
-        run.state,
+        state,
     )
 
 
