@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.acquisition import ImageAcquisition, camera
+    from epypes.acquisition.video import video
     from epypes.batch import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.batch.cases import Case
     from epypes.batch.check import check
@@ -82,6 +83,7 @@ _HOMES = {
     "errors": "epypes",
     "ImageAcquisition": "epypes.acquisition",
     "camera": "epypes.acquisition",
+    "video": "epypes.acquisition.video",
     "show": "epypes.display",
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
@@ -206,6 +208,7 @@ __all__ = [
     "unguarded",
     "union",
     "verify",
+    "video",
 ]
 
 

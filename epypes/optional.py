@@ -17,6 +17,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "PIL": ("pillow", "widgets"),
     "aio_pika": ("aio-pika", "rabbitmq"),
     "anywidget": ("anywidget", "widgets"),
+    "av": ("av", "vision"),
     "cv2": ("opencv-python-headless", "vision"),
     "dask": ("dask", "cluster"),
     "distributed": ("distributed", "cluster"),

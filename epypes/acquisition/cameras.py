@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import re
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from numbers import Integral, Real
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, cast, runtime_checkable
 
 from epypes.acquisition.files import image_files, is_image_file, quiet_opencv, read_image
-from epypes.acquisition.frames import frame_image
+from epypes.acquisition.frames import Frame, frame_image
+from epypes.acquisition.video import Video
 from epypes.errors import CameraUnavailable, ImageFileError
 from epypes.optional import optional_import
 from epypes.run.guard import is_array
@@ -45,24 +47,37 @@ class Camera(Protocol):
         """
 
 
-def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camera:
-    """Return a camera: any source of images, behind ``read`` and ``close``.
+class IterableCamera(Camera, Protocol):
+    """A camera whose frames come in a loop, too: ``for frame in camera``."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames with their numbers, from 0: those of a file or folder once, those of a device without end.
+
+        A video's frames have their times; those that are damaged are left out. Nothing waits for the time of the next
+        frame unless ``fps`` was given.
+        """
+
+
+def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> IterableCamera:
+    """Return a camera: any source of images, behind ``read`` and ``close``, and as an iterable of frames.
 
     Parameters
     ----------
     source
-        - the path of an image, of a folder (its images by name, ``img2`` before ``img10``) or of a video;
+        - the path of an image, of a folder (its images by name, ``img2`` before ``img10``) or of a video, and what
+          `epypes.video` returns;
         - an array (y, x) or (y, x, channels): a copy of it again and again;
         - the number of a device, or the URL of a stream;
         - an opened ``cv2.VideoCapture``, which is yours to release, or a function that returns one, which is called
           again when the device has failed: so you can set what you like on it;
         - an iterable of arrays, an iterator or a generator, or a function that returns one;
-        - an object with ``read`` and ``close`` of its own (`Camera`).
+        - an object with ``read`` and ``close`` of its own (`Camera`), which is returned as it is if ``fps`` is None.
     fps
         Frames per second at most. None: 10 for an image, a folder and a list, as recorded for a video, and the source's
         own pace for all others. ``math.inf``: no waiting. Of a device, the frames in between are thrown away.
     loop
-        Whether images, folders, videos, lists and what functions return begin anew after their last frame.
+        Whether images, folders, videos, lists and what functions return begin anew after their last frame when they are
+        read. A ``for`` over the camera has them once.
 
     Raises
     ------
@@ -79,6 +94,8 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camer
     >>> left = camera(np.zeros((4, 6), np.uint8), fps=100)
     >>> left.read().shape
     (4, 6)
+    >>> for frame in camera("belt.mp4"):  # doctest: +SKIP
+    ...     print(frame.number, frame.time_s, frame.image.shape)
     """
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, Real) or not fps > 0):
         raise ValueError(f"fps must be a number above 0, or None for the source's own pace, not {fps!r:.40}.")
@@ -96,16 +113,22 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camer
         return _of_capture(source, fps, loop)
     if _is_camera(source):
         return paced(source, fps)
-    if isinstance(source, Iterator):
-        return paced(SequenceCamera(lambda: source, loop=False), fps)
     if isinstance(source, Iterable) and not isinstance(source, bytes | bytearray | memoryview | dict | set | frozenset):
-        return paced(SequenceCamera(lambda: source, loop), fps or USUAL_FPS)
+        return _of_iterable(source, fps, loop)
     if callable(source):
         return _of_function(source, fps, loop)
     raise TypeError(
         f"A camera can't be made of {type(source).__name__!r}. Give a path, an array, the number of a device, a "
         "cv2.VideoCapture, an iterable of arrays, or an object with read() and close()."
     )
+
+
+def _of_iterable(source: Iterable[Any], fps: float | None, loop: bool) -> IterableCamera:
+    if isinstance(source, Iterator):
+        return paced(SequenceCamera(lambda: source, loop=False), fps)
+    if isinstance(source, Video):
+        return paced(SequenceCamera(source.frames, loop), fps, source.fps or USUAL_FPS)
+    return paced(SequenceCamera(lambda: source, loop), fps, USUAL_FPS)
 
 
 def has_twins(sources: Iterable[Any]) -> bool:
@@ -116,13 +139,13 @@ def has_twins(sources: Iterable[Any]) -> bool:
     return len(set(single)) < len(single)
 
 
-def _of_capture(source: Any, fps: float | None, loop: bool, opening: Callable[[], Any] | None = None) -> Camera:
-    """Return the camera on a device, a stream, a video file, or a capture that the caller has opened.
+def _of_capture(source: Any, fps: float | None, loop: bool, opening: Callable[[], Any] | None = None) -> IterableCamera:
+    """Return the camera on a device, a stream, or a capture that the caller has opened.
 
     Parameters
     ----------
     source
-        The number or path of a device or the URL of a stream, both as int or str; the Path of a video file; a capture.
+        The number or path of a device or the URL of a stream, both as int or str; a capture.
     fps, loop
         As of `epypes.camera`.
     opening
@@ -134,33 +157,28 @@ def _of_capture(source: Any, fps: float | None, loop: bool, opening: Callable[[]
     if isinstance(source, int | str):
         # A URL may hold a password.
         name = "Camera " + re.sub(r"//[^/@]*@", "//", str(source))
-        text = f"{name} can't be opened. Check that it is connected and that no other program uses it."
-        opening = partial(_opened, source, CameraUnavailable, name, text)
+        opening = partial(_opened, source, name)
         return LiveCamera(name, opening(), opening, fps)
-    if isinstance(source, Path):
-        path = str(source)
-        text = f"{path!r} is neither an image nor a video that OpenCV can read."
-        opening = partial(_opened, path, ImageFileError, path, text)
-        return _video_camera(opening(), opening, fps, loop)
     if not source.isOpened():
         raise CameraUnavailable("The capture", "The capture that was given is not open. Check it with isOpened().")
     # A file has an end, and never runs ahead.
     if source.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
-        return _video_camera(source, opening, fps, loop)
+        return _capture_camera(source, opening, fps, loop)
     return LiveCamera("The capture", source, opening, fps)
 
 
-def _opened(source: int | str, kind: Callable[[str, str], Exception], name: str, text: str) -> Any:
+def _opened(source: int | str, name: str) -> Any:
     import cv2
 
     with quiet_opencv():
         capture = cv2.VideoCapture(source)
     if not capture.isOpened():
-        raise kind(name, text)
+        text = f"{name} can't be opened. Check that it is connected and that no other program uses it."
+        raise CameraUnavailable(name, text)
     return capture
 
 
-def _of_path(path: Path, fps: float | None, loop: bool) -> Camera:
+def _of_path(path: Path, fps: float | None, loop: bool) -> IterableCamera:
     try:
         is_device, is_folder = path.is_char_device(), path.is_dir()
     except OSError as error:  # of a name that is too long
@@ -173,18 +191,21 @@ def _of_path(path: Path, fps: float | None, loop: bool) -> Camera:
         if not files:
             text = f"There are no images in folder {str(path)!r}. Put PNG, JPEG or TIFF into it."
             raise ImageFileError(str(path), text)
-        return paced(SequenceCamera(lambda: map(read_image, files), loop), fps or USUAL_FPS)
+        return paced(SequenceCamera(lambda: map(read_image, files), loop), fps, USUAL_FPS)
     if not path.is_file() or is_image_file(path):
         return _still_camera(read_image(path), fps, loop)
-    return _of_capture(path, fps, loop)
+    unread = [Video(path)]
+    # Opened anew for each round: the file may be another one by then.
+    start = SequenceCamera(lambda: (unread.pop() if unread else Video(path)).frames(), loop)
+    return paced(start, fps, unread[0].fps or USUAL_FPS)
 
 
-def _still_camera(image: Any, fps: float | None, loop: bool) -> Camera:
+def _still_camera(image: Any, fps: float | None, loop: bool) -> IterableCamera:
     frame = frame_image([image])
-    return paced(SequenceCamera(lambda: (frame,), loop), fps or USUAL_FPS)
+    return paced(SequenceCamera(lambda: (frame,), loop), fps, USUAL_FPS)
 
 
-def _of_function(source: Callable[[], Any], fps: float | None, loop: bool) -> Camera:
+def _of_function(source: Callable[[], Any], fps: float | None, loop: bool) -> IterableCamera:
     made = source()
     if _is_capture(made):
         return _of_capture(made, fps, loop, source)
@@ -230,24 +251,35 @@ class SequenceCamera:
         items = self._items
         if items is not None:
             for item in items:
-                return _required(item)
+                return _image(item)
             if not self._loop:
                 return None
         self._items = items = iter(self._start())
         # A round without any item would be followed by others for ever.
         for item in items:
-            return _required(item)
+            return _image(item)
         return None
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames of one round."""
+        for number, item in enumerate(self._start()):
+            yield item if isinstance(item, Frame) else _frame([_image(item)], number)
 
     def close(self) -> None:
         """Begin anew with the next `read`; an iterator, which can't, goes on where it was."""
         self._items = None
 
 
-def _required(item: Any) -> Any:
+def _image(item: Any) -> Any:
     if item is None:
         raise TypeError("The iterator gave None, which is no image. Let it end, or wait inside it for the next one.")
-    return item
+    return item.image if isinstance(item, Frame) else item
+
+
+def _frame(given: list[Any], number: int) -> Frame:
+    """Return what a camera gave, which comes in a list of one, as a frame."""
+    captured_ns = time.time_ns()
+    return Frame(frame_image(given), captured_ns, number)
 
 
 # -- frames per second ------------------------------------------------------------------------------------------------
@@ -262,10 +294,12 @@ class PacedCamera:
         Gives the frames.
     fps
         Frames per second. If the reader comes late, the next frame is due one period later: nothing is caught up.
+    is_asked
+        Whether the caller has asked for this pace, so that a ``for`` keeps to it.
     """
 
-    def __init__(self, camera: Camera, fps: float) -> None:
-        self._camera, self._period_s = camera, 1 / fps
+    def __init__(self, camera: Camera, fps: float, *, is_asked: bool = True) -> None:
+        self._camera, self._period_s, self._is_asked = camera, 1 / fps, is_asked
         self._due_s = -math.inf
         self._closing = threading.Event()
 
@@ -277,15 +311,46 @@ class PacedCamera:
         self._due_s = next_due_s(self._due_s, self._period_s)
         return self._camera.read()
 
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames of the camera, when they are due if that was asked for; `close` ends the wait."""
+        self._closing.clear()
+        due_s = -math.inf
+        for frame in _frames_of(self._camera):
+            if self._is_asked and self._closing.wait(min(due_s - monotonic(), threading.TIMEOUT_MAX)):
+                return
+            due_s = next_due_s(due_s, self._period_s)
+            yield frame
+
     def close(self) -> None:
         """End the wait, and close the camera."""
         self._closing.set()
         self._camera.close()
 
 
-def paced(camera: Camera, fps: float | None) -> Camera:
-    """Return a camera that is kept to ``fps`` frames per second; the camera as it is for None and infinity."""
-    return camera if fps is None or fps == math.inf else PacedCamera(camera, float(fps))
+def paced(camera: Camera, fps: float | None, usual_fps: float = math.inf) -> IterableCamera:
+    """Return a camera that is kept to ``fps`` frames per second, of which None are the usual ones.
+
+    With infinity it is the camera as it is.
+    """
+    kept_fps = usual_fps if fps is None else float(fps)
+    if kept_fps == math.inf:
+        return cast(IterableCamera, camera)
+    return PacedCamera(camera, kept_fps, is_asked=fps is not None)
+
+
+def _frames_of(camera: Camera) -> Iterator[Frame]:
+    """Return the frames of a camera, one of a user's own included."""
+    return iter(camera) if isinstance(camera, Iterable) else _frames_read(camera)
+
+
+def _frames_read(camera: Camera) -> Iterator[Frame]:
+    number = 0
+    while True:
+        given = [camera.read()]
+        if given[0] is None:
+            return
+        yield _frame(given, number)
+        number += 1
 
 
 def next_due_s(due_s: float, period_s: float) -> float:
@@ -344,6 +409,10 @@ class LiveCamera:
             raise CameraUnavailable(self._name, f"{self._name} gave no frame.")
         return image
 
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield frames without end, until `close` is called; CameraUnavailable if the camera gives none."""
+        return _frames_read(self)
+
     def _next(self, capture: Any) -> Any:
         while capture.grab() and not self._is_closed:
             if monotonic() >= self._due_s:
@@ -364,7 +433,7 @@ class LiveCamera:
                 self._lock.release()
 
 
-def _video_camera(capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool) -> Camera:
+def _capture_camera(capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool) -> IterableCamera:
     import cv2
 
     unread = [capture]
@@ -377,7 +446,7 @@ def _video_camera(capture: Any, opening: Callable[[], Any] | None, fps: float | 
 
     recorded_fps = float(capture.get(cv2.CAP_PROP_FPS))
     usual_fps = recorded_fps if 0 < recorded_fps <= 1_000 else USUAL_FPS
-    return paced(SequenceCamera(start, loop), fps or usual_fps)
+    return paced(SequenceCamera(start, loop), fps, usual_fps)
 
 
 def _frames(capture: Any, *, is_own: bool, loop: bool) -> Iterator[Any]:

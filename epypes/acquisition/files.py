@@ -24,6 +24,11 @@ IMAGE_ENDINGS: Final = frozenset(
     {".avif", ".bmp", ".dib", ".exr", ".gif", ".hdr", ".jp2", ".jpe", ".jpeg", ".jpg", ".pbm"}
     | {".pgm", ".png", ".pnm", ".ppm", ".ras", ".sr", ".tif", ".tiff", ".webp"}
 )
+# Endings of the containers that FFmpeg reads with times.
+VIDEO_ENDINGS: Final = frozenset(
+    {".3gp", ".asf", ".avi", ".flv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".ogv"}
+    | {".ts", ".webm", ".wmv"}
+)
 # cv2.utils.logging.LOG_LEVEL_SILENT
 _SILENT: Final = 0
 _quiet_lock = threading.Lock()
@@ -56,6 +61,8 @@ def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 |
         image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None:
         text = f"{str(path)!r} is not an image that OpenCV can read. Use PNG, JPEG, TIFF, BMP or WebP."
+        if is_video_name(file):
+            text = f"{str(path)!r} is a video, where one image is wanted. Take a frame of it: ep.video(path)[0]."
         raise ImageFileError(str(path), text)
     return image if order == "bgr" else _in_other_order(image)  # type: ignore[no-any-return]
 
@@ -113,6 +120,11 @@ def image_files(path: Path) -> list[Path]:
         return sorted(filter(Path.is_file, named), key=natural_order)
     except OSError as error:
         raise ImageFileError(str(path), f"Folder {str(path)!r} can't be read: {error.strerror}.") from error
+
+
+def is_video_name(path: Path) -> bool:
+    """Whether a path has the ending of a video."""
+    return path.suffix.lower() in VIDEO_ENDINGS
 
 
 def is_image_file(path: Path) -> bool:

@@ -26,12 +26,16 @@ class Frame:
     captured_ns
         When the camera gave it, Unix time in ns.
     number
-        Its place in the camera's stream, from 1.
+        Its place in the camera's stream: from 1 in an ImageAcquisition, from 0 in a video and in a ``for`` over a
+        camera.
+    time_s
+        Of a video, its time since the first frame, in s; None of what has no times.
     """
 
     image: Array
     captured_ns: int
     number: int
+    time_s: float | None = None
 
     def __repr__(self) -> str:
         shape = getattr(self.image, "shape", "?")

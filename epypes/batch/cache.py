@@ -18,7 +18,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 from warnings import warn
+from weakref import WeakKeyDictionary
 
+from epypes.acquisition.video import Video, VideoFrame
 from epypes.batch.cases import Case
 from epypes.batch.items import Item, frames_of
 from epypes.batch.results import Outcome
@@ -115,7 +117,10 @@ def reader_text(name: str) -> str:
 
 
 def payload_digest(payload: Mapping[str, Any]) -> str:
-    """Return the digest of a payload: of every token the file's content, wherever it is, or the value.
+    """Return the digest of a payload: of every token the content of the file, wherever it is, or the value.
+
+    Of a frame of a video it is the content of the video with the number of the frame, so that what is stored is found
+    without decoding.
 
     Raises
     ------
@@ -124,7 +129,10 @@ def payload_digest(payload: Mapping[str, Any]) -> str:
     """
     parts: list[str] = []
     for token, value in sorted(payload.items()):
-        digest = file_digest(value) if isinstance(value, Path) else value_digest(value)
+        if isinstance(value, VideoFrame):
+            digest = _frame_digest(value)
+        else:
+            digest = file_digest(value) if isinstance(value, Path) else value_digest(value)
         if not digest:
             raise NoDigest(f"{str(value)!r}, which can't be read")
         parts += token, digest
@@ -136,6 +144,19 @@ def _content_digest(item: Item, runner: CompGraphRunner) -> str:
     if item.frames is None:
         return payload_digest(item.payload)
     return combined_digest("frames", *(payload_digest(frame.payload) for frame in frames_of(item, runner))).hex()
+
+
+# Of videos that are open, since each of their frames asks for it.
+_VIDEO_DIGESTS: Final[WeakKeyDictionary[Video, str]] = WeakKeyDictionary()
+
+
+def _frame_digest(frame: VideoFrame) -> str:
+    video = frame.video
+    if video not in _VIDEO_DIGESTS:
+        video.require_unchanged()
+        _VIDEO_DIGESTS[video] = file_digest(video.path)
+    file = _VIDEO_DIGESTS[video]
+    return combined_digest("frame", file, str(frame.number)).hex() if file else ""
 
 
 def value_label(value: Any) -> str:

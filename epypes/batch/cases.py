@@ -25,8 +25,9 @@ A check is a metric, of one token or of the whole run, with its bounds. The file
     max = 300
 
 A text that ends like the name of an image, of ``.npy`` or of ``.npz`` is a file, whose path is relative to that of the
-cases; other texts and numbers stand for themselves. The metrics are ``equal``, ``close`` (``atol``, ``rtol``), ``iou``
-(``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
+cases; other texts and numbers stand for themselves. So is a text in ``inputs`` that ends like the name of a video: each
+of its frames is a case of its own, with the same checks. The metrics are ``equal``, ``close`` (``atol``, ``rtol``),
+``iou`` (``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
 ``epypes.batch.metrics``, whose options stand beside ``min`` and ``max``. Of label images, integers with more than one
 value besides 0, ``iou`` is the mean over the objects, paired one with one; one that is left over on either side counts
 0. A check may have a ``name``. A case without a check passes if it runs.
@@ -38,12 +39,14 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, is_one_image, read_value
+from epypes.acquisition.files import is_video_name
+from epypes.acquisition.video import Video, VideoFrame
+from epypes.batch.items import by_frame, defensive_copy, holds_its_arrays, is_file, is_one_image, read_value
 from epypes.batch.metrics import METRICS
 from epypes.batch.results import short_text
 from epypes.bundle.settings import decode_value
@@ -110,10 +113,11 @@ class Case:
     ----------
     inputs
         By free source token: a value, or the path of its file; a text is a path if it ends like an image, ``.npy`` or
-        ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token. Of a graph
-        with state (``ep.delay``) a sequence of these, or a folder or glob of images: they are run one after another
-        from the initial state, and what the last one gives is measured. If one fails, the case has failed. What is to
-        count over all of them is a token with state itself, such as a sum. One image is a series of one.
+        ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token. A video, or
+        the path of one, stands for a case per frame, each with the same checks. Of a graph with state (``ep.delay``) a
+        case is a sequence: of these, a folder or glob of images, or a video. They are run one after another from the
+        initial state, and what the last one gives is measured; if one fails, the case has failed. What is to count over
+        all of them is a token with state itself, such as a sum. One image is a series of one.
     expected
         By token: the value that it must have, or the path of a file that holds it (an image, ``.npy`` or ``.npz``);
         a text with such an ending is a path. Where no function and no metric that compares looks at a token, it must
@@ -193,16 +197,21 @@ def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
     Parameters
     ----------
     given
-        The path of a CASES.toml, or an iterable of cases, of dicts with a case's parts, or of inputs alone.
+        The path of a CASES.toml; an iterable of cases, of dicts with a case's parts, or of inputs alone; or a video, or
+        the path of one, of which each frame is a case. A case with a video becomes one per frame.
     are_series
-        Whether the graph has state, so that the inputs of a case are a sequence.
+        Whether the graph has state, so that the inputs of a case are a sequence: a video is one case.
 
     Raises
     ------
     ScaleError
         There is none, or one is not a case; or of a graph with state, one is an image alone.
+    ImageFileError
+        A video can't be opened.
     """
-    if isinstance(given, str | os.PathLike):
+    if isinstance(given, Video) or (isinstance(given, str | os.PathLike) and is_video_name(Path(given))):
+        found = [Case(given)]
+    elif isinstance(given, str | os.PathLike):
         found = _read_file(Path(given), are_series)
     elif isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(
@@ -214,11 +223,23 @@ def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
         ]
     if not found:
         raise ScaleError("There are no cases. Give at least one: ep.Case(inputs, expected={...}).")
+    if not are_series:
+        found = [one for case in found for one in _by_frame(case)]
     taken: dict[str, int] = {}
     return tuple(
         replace(case, name=_unique(case.name or _file_name(case.inputs) or f"#{number}", taken))
         for number, case in enumerate(found)
     )
+
+
+def _by_frame(case: Case) -> Iterator[Case]:
+    """Yield a case, or, of one with a video, a case for each frame."""
+    for inputs in by_frame(case.inputs):
+        if inputs is case.inputs:
+            yield case
+        else:
+            frame = next(value for value in _values(inputs) if isinstance(value, VideoFrame))
+            yield replace(case, inputs=inputs, name=f"{case.name} #{frame.number}" if case.name else frame.name)
 
 
 def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:
@@ -276,8 +297,11 @@ def _copied(case: Case) -> Case:
 
 
 def _file_name(inputs: Any) -> str:
-    values = inputs.values() if isinstance(inputs, Mapping) else (inputs,)
-    return next((PurePath(value).name for value in values if is_file(value)), "")
+    return next((PurePath(value).name for value in _values(inputs) if is_file(value)), "")
+
+
+def _values(inputs: Any) -> Iterable[Any]:
+    return inputs.values() if isinstance(inputs, Mapping) else (inputs,)
 
 
 def _unique(name: str, taken: dict[str, int]) -> str:
@@ -460,23 +484,25 @@ def _case_of_table(table: Mapping[str, Any], folder: Path, is_series: bool) -> C
     values = table.get("hyperparameters")
     if isinstance(values, Mapping):
         values = {token: _hyperparameter(token, entry) for token, entry in values.items()}
-    inputs = (_series_in_folder if is_series else _in_folder)(table["inputs"], folder)
+    given = table["inputs"]
+    inputs = _series_in_folder(given, folder) if is_series else _in_folder(given, folder, has_videos=True)
     return Case(inputs, expected, metrics, name, values)
 
 
-def _in_folder(value: Any, folder: Path) -> Any:
+def _in_folder(value: Any, folder: Path, *, has_videos: bool = False) -> Any:
     """Return the path of what names a file, relative to that of the cases, by token too; any other value as it is."""
     if isinstance(value, Mapping):
-        return {token: _in_folder(item, folder) for token, item in value.items()}
-    return folder / Path(value).expanduser() if is_file(value) else value
+        return {token: _in_folder(item, folder, has_videos=has_videos) for token, item in value.items()}
+    names_video = has_videos and isinstance(value, str) and is_video_name(Path(value))
+    return folder / Path(value).expanduser() if names_video or is_file(value) else value
 
 
 def _series_in_folder(inputs: Any, folder: Path) -> Any:
     """Return the inputs of a case of a graph with state, with the paths of files, of a folder or of a glob."""
     if isinstance(inputs, list):
-        return [_in_folder(item, folder) for item in inputs]
+        return [_in_folder(item, folder, has_videos=True) for item in inputs]
     is_path = isinstance(inputs, str) and (not is_one_image(inputs) or (folder / inputs).is_dir())
-    return folder / inputs if is_path else _in_folder(inputs, folder)
+    return folder / inputs if is_path else _in_folder(inputs, folder, has_videos=True)
 
 
 def _hyperparameter(token: str, entry: Any) -> Any:

@@ -23,7 +23,7 @@ from concurrent.futures import (
 from dataclasses import replace
 from typing import Any, Final
 
-from epypes.batch.job import Job, failed_outcomes, run_job
+from epypes.batch.job import Job, failed_outcomes, read_frames, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
     PackagedJob,
@@ -35,7 +35,7 @@ from epypes.batch.packaged_graph import (
 )
 from epypes.batch.results import ErrorInfo, Outcome
 from epypes.bundle.clone import clone_runner
-from epypes.errors import EpypesError, ExecutorBroken, ScaleError
+from epypes.errors import EpypesError, ExecutorBroken, ImageFileError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.runner import branched
 from epypes.wording import counted, ended
@@ -220,6 +220,13 @@ def _submitted(executor: Executor, call: Callable[..., Any], argument: object) -
         raise _SubmitRefused(_error_text(error)) from error
 
 
+def _done(outcomes: list[Outcome]) -> Future[Any]:
+    """Return the future of a job that was run in this thread, as one whose input can't be read."""
+    done: Future[Any] = Future()
+    done.set_result(outcomes)
+    return done
+
+
 # -- backends -------------------------------------------------------------------------------------------------------
 
 
@@ -241,7 +248,10 @@ class _Threads:
 
     def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
         """Give a job to a thread."""
-        return _submitted(self._executor, self._run, job)
+        try:
+            return _submitted(self._executor, self._run, read_frames(job, self._runner.cg))
+        except ImageFileError:
+            return _done(list(run_job(branched(self._runner), job)))
 
     def _run(self, job: Job) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -278,9 +288,11 @@ class _Processes:
         """Send a job to a worker process."""
         package = self._package = self._package or package_of(self._runner, job.item)
         if package is None:
-            here: Future[Any] = Future()
-            here.set_result(list(run_job(clone_runner(self._runner), job)))
-            return here
+            return _done(list(run_job(clone_runner(self._runner), job)))
+        try:
+            job = read_frames(job, self._runner.cg, of_cases=True)
+        except ImageFileError:
+            return _done(list(run_job(clone_runner(self._runner), job)))
         # A worker process that has not unpacked the package yet asks for its files.
         package = package if with_files else replace(package, files=None)
         runner = self._runner

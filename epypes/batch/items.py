@@ -1,4 +1,4 @@
-"""The inputs of a map, a sweep or a check: image files and values, one after another."""
+"""The inputs of a map, a sweep or a check: image files, frames of videos, and values, one after another."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.acquisition.files import IMAGE_ENDINGS, image_files, natural_order, read_image
+from epypes.acquisition.files import IMAGE_ENDINGS, image_files, is_video_name, natural_order, read_image
+from epypes.acquisition.frames import Frame
+from epypes.acquisition.video import Video, VideoFrame
 from epypes.bundle.clone import clone_runner
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph, colour_order
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array, is_plain_array
 
-_KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
+_KINDS: Final = (
+    "a folder, a video, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
+)
 _SHOWN: Final = "*?["
+# The series of frames that are given one by one.
+_CAMERA: Final = "camera"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,21 +36,62 @@ class Item:
     number
         Its place, from 0.
     name
-        Of a file its name, relative to the folder that was given; otherwise its place, as ``"#3"``.
+        Of a file its name, relative to the folder that was given, of a frame with its number: ``"belt.mp4 #17"``;
+        otherwise its place, as ``"#3"``.
     payload
-        Values by free source token; a Path stands for an image file, which is read where the item is run.
+        Values by free source token; a Path stands for an image file, a VideoFrame for a frame of a video, which are
+        read when the item is run.
     series
-        The key of its series.
+        The key of its series. Without one that the caller gives it is the video, as its path, or the camera that it is
+        a frame of, and "" for an item that stands alone: the items of one series come in the order of their times.
+    frame
+        The number of the frame, from 0; None for what is none.
+    time_s
+        The time of the frame in s since the first one; None for what has no time.
     frames
-        Of a case of a graph with state: the items that are run one after another in its place, or the path of a folder
-        or a glob of them; None of any other item.
+        Of a case of a graph with state: the items that are run one after another in its place, or the path of a folder,
+        of a glob or of a video of them; None of any other item.
     """
 
     number: int
     name: str
     payload: Mapping[str, Any]
-    series: Hashable = None
+    series: Hashable = ""
+    frame: int | None = None
+    time_s: float | None = None
     frames: tuple[Item, ...] | str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FileSet:
+    """The files that a path or a glob names.
+
+    Attributes
+    ----------
+    files
+        In their order; videos are opened.
+    root
+        The folder that their names are relative to.
+    """
+
+    files: tuple[Path | Video, ...]
+    root: Path
+
+
+def image_set(images: Any) -> Any:
+    """Return an image set whose files are found and whose videos are opened, so that its items can be counted.
+
+    Raises
+    ------
+    ScaleError
+        There are no files.
+    ImageFileError
+        A video can't be opened.
+    """
+    if isinstance(images, str | Path):
+        files, root = _files(images)
+        return FileSet(tuple(Video(file) if is_video_name(file) else file for file in files), root)
+    return [_opened(value) for value in images] if type(images) in (list, tuple) else images
 
 
 def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
@@ -53,10 +100,11 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     Parameters
     ----------
     images
-        A folder, a glob, one file, or an iterable of images (arrays), paths of image files, or dicts by free source
-        token, in which a Path stands for an image file, and so does a text with the ending of an image, of ``.npy`` or
-        of ``.npz`` if there is such a file; any other text stands for itself. What a generator gives is copied, since
-        it may be one array that is filled again each time.
+        A folder, a glob, one file, a video, or an iterable of images (arrays), frames, paths of image files and videos,
+        or dicts by free source token, in which a Path stands for a file, and so does a text with the ending of an
+        image, of a video, of ``.npy`` or of ``.npz`` if there is such a file; any other text stands for itself. A video
+        gives an item per frame. What a generator gives is copied, since it may be one array that is filled again each
+        time.
     runner
         Its free source tokens are what an item has to give.
 
@@ -64,12 +112,14 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     ------
     ScaleError
         The set is empty, which of a generator is known at its end; or an item does not give these tokens.
+    ImageFileError
+        A video can't be opened.
     """
-    free = runner.free_source_tokens
-    if isinstance(images, str | Path):
-        files, root = _files(images)
-        token = _only(free, f"{str(images)!r} gives one image")
-        return iter([Item(number, _name(file, root), {token: file.absolute()}) for number, file in enumerate(files)])
+    free, images = runner.free_source_tokens, image_set(images)
+    if isinstance(images, FileSet):
+        return _of_files(images, _only(free, f"{str(images.root)!r} gives one image at a time"))
+    if isinstance(images, Video):
+        images = [images]
     _check_set(images)
     return _of_values(images, free)
 
@@ -80,24 +130,32 @@ def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
     Raises
     ------
     ImageFileError
-        A file is missing, or no image.
+        A file is missing, or no image; a frame is damaged.
     ScaleError
         A ``.npy`` or ``.npz`` can't be read.
     """
     return {
-        token: read_value(value, cg, token) if isinstance(value, Path) else value
+        token: read_value(value, cg, token) if isinstance(value, Path | VideoFrame) else value
         for token, value in item.payload.items()
     }
 
 
 def count_of(images: Any) -> int | None:
     """Return how many items there will be, as far as that is known without going through them."""
-    if isinstance(images, str | Path):
-        return len(_files(images)[0])
+    images = image_set(images)
+    if isinstance(images, Video):
+        return len(images)
+    if isinstance(images, FileSet) or type(images) is list:
+        return sum(map(_count, images.files if isinstance(images, FileSet) else images))
     try:
         return len(images)
     except TypeError:
         return None
+
+
+def _count(value: Any) -> int:
+    video = _video_in(value) if isinstance(value, Mapping | Video) else None
+    return 1 if video is None else len(video[1])
 
 
 # -- series -----------------------------------------------------------------------------------------------------
@@ -114,7 +172,7 @@ def with_series(items: Iterator[Item], series: SeriesKeys | None) -> Iterator[It
         The inputs.
     series
         A function that is called with the value of an item, of several free source tokens with a dict of values; of a
-        file it is given the Path. Or a key per item. None: all are one series, whose key is None.
+        file it is given the Path, of a frame of a video the VideoFrame. Or a key per item. None: items keep theirs.
 
     Raises
     ------
@@ -133,8 +191,10 @@ def with_series(items: Iterator[Item], series: SeriesKeys | None) -> Iterator[It
 
 def _keyed(items: Iterator[Item], key_of: Callable[[Any], Hashable]) -> Iterator[Item]:
     for item in items:
-        values = dict(item.payload)
-        yield _in_series(item, key_of(values if len(values) != 1 else next(iter(values.values()))))
+        key = key_of(next(iter(item.payload.values())) if len(item.payload) == 1 else dict(item.payload))
+        yield _in_series(item, key)
+        # This generator waits for its caller, and must not keep the item alive meanwhile.
+        del item
 
 
 def _zipped(items: Iterator[Item], series: Iterable[Hashable]) -> Iterator[Item]:
@@ -145,6 +205,7 @@ def _zipped(items: Iterator[Item], series: Iterable[Hashable]) -> Iterator[Item]
         except StopIteration:
             raise ScaleError(f"series has {number} keys, and there are more items. Give a key per item.") from None
         yield _in_series(item, key)
+        del item
     if next(keys, ABSENT_KEY) is not ABSENT_KEY:
         raise ScaleError(f"series has more keys than there are items: {number + 1}. Give a key per item.")
 
@@ -168,11 +229,14 @@ def is_one_image(inputs: Any) -> bool:
     """Whether the inputs of a case of a graph with state are one payload, and no sequence of them."""
     if isinstance(inputs, str | os.PathLike):
         path = Path(inputs).expanduser()
-        return path.is_file() or not (path.is_dir() or any(mark in str(inputs) for mark in _SHOWN))
+        is_several = path.is_dir() or any(mark in str(inputs) for mark in _SHOWN)
+        return not is_video_name(path) and (path.is_file() or not is_several)
     shape = getattr(inputs, "shape", None)
     if isinstance(shape, tuple):
         return len(shape) < 3 or (len(shape) == 3 and shape[2] in (3, 4))
-    return isinstance(inputs, Mapping) or not isinstance(inputs, Iterable)
+    if isinstance(inputs, Mapping):
+        return not any(isinstance(value, Video) or _is_video_file(value) for value in inputs.values())
+    return not isinstance(inputs, Iterable)
 
 
 def case_items(inputs: Iterable[Any], runner: CompGraphRunner) -> Iterator[Item]:
@@ -190,11 +254,11 @@ def case_items(inputs: Iterable[Any], runner: CompGraphRunner) -> Iterator[Item]
         if isinstance(given, str | os.PathLike) and not is_one_image(given):
             path = os.path.abspath(Path(given).expanduser())
             _only(runner.free_source_tokens, f"{str(given)!r} gives one image at a time")
-            yield Item(number, str(given), {}, number, path)
+            yield Item(number, str(given), {}, frames=path)
         else:
-            frames = tuple(items_of([given] if is_one_image(given) else given, runner))
-            name = frames[0].name if len(frames) == 1 else f"#{number}"
-            yield Item(number, name, {}, number, frames)
+            is_payload = is_one_image(given) or isinstance(given, Mapping)
+            frames = tuple(items_of([given] if is_payload else given, runner))
+            yield Item(number, frames[0].name if len(frames) == 1 else f"#{number}", {}, frames=frames)
 
 
 def frames_of(item: Item, runner: CompGraphRunner) -> Iterator[Item]:
@@ -248,6 +312,85 @@ def _name(file: Path, root: Path) -> str:
     return str(file.relative_to(root)) if file.is_relative_to(root) else str(file)
 
 
+def _of_files(files: FileSet, token: str) -> Iterator[Item]:
+    number = 0
+    for file in files.files:
+        if isinstance(file, Video):
+            name = _name(file.path, files.root)
+            for frame in _frames(file):
+                yield _frame_item(number, f"{name} #{frame.number}", {token: frame}, frame)
+                number += 1
+            file.close()
+        else:
+            yield Item(number, _name(file, files.root), {token: file.absolute()})
+            number += 1
+
+
+# -- videos -----------------------------------------------------------------------------------------------------
+
+
+def by_frame(value: Any) -> Iterator[Any]:
+    """Yield an input, or, of a video, each frame in its place.
+
+    Parameters
+    ----------
+    value
+        A value, a video or the path of one, or a dict by token with one of these in it.
+
+    Raises
+    ------
+    ScaleError
+        A dict names several videos.
+    """
+    found = _video_in(value)
+    if found is None:
+        yield value
+        return
+    token, video = found
+    for frame in _frames(video):
+        yield {**value, token: frame} if isinstance(value, Mapping) else frame
+    video.close()
+
+
+def _frames(video: Video) -> Iterator[VideoFrame]:
+    return (VideoFrame(video, number) for number in video.numbers)
+
+
+def _video_in(value: Any) -> tuple[str, Video] | None:
+    """Return the video that an input is or has, opened, and its token in a dict; None if there is none."""
+    opened = _opened(value)
+    if isinstance(opened, Video):
+        return "", opened
+    videos = [(token, one) for token, one in opened.items() if isinstance(one, Video)] if _is_dict(opened) else []
+    if len(videos) > 1:
+        tokens = ", ".join(repr(token) for token, _ in videos)
+        text = f"An item has videos for {tokens}. Pair their frames, and make a dict of each pair:"
+        raise ScaleError(f"{text} zip(ep.video('left.mp4'), ep.video('right.mp4')).")
+    return videos[0] if videos else None
+
+
+def _opened(value: Any) -> Any:
+    """Return the video that a path stands for, in a dict too; any other value as it is."""
+    if isinstance(value, str | Path) and is_video_name(Path(value)):
+        return Video(Path(value).expanduser())
+    if _is_dict(value) and any(map(_is_video_file, value.values())):
+        return {token: _opened(one) if _is_video_file(one) else one for token, one in value.items()}
+    return value
+
+
+def _is_dict(value: Any) -> bool:
+    return isinstance(value, Mapping)
+
+
+def _is_video_file(value: Any) -> bool:
+    is_path = isinstance(value, str | Path) and is_video_name(Path(value))
+    return is_path and (isinstance(value, Path) or Path(value).expanduser().is_file())
+
+
+def _frame_item(number: int, name: str, payload: Mapping[str, Any], frame: VideoFrame) -> Item:
+    return Item(number, name, payload, str(frame.video.path), frame.number, frame.time_s)
+
+
 # -- values -----------------------------------------------------------------------------------------------------
 
 
@@ -262,22 +405,32 @@ def _check_set(images: Any) -> None:
 
 
 def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
-    number, is_copied = -1, not holds_its_arrays(images)
-    for number, value in enumerate(images):
+    number, is_copied = 0, not holds_its_arrays(images)
+    for value in images:
+        if _video_in(value) is not None:
+            for one in by_frame(value):
+                yield _item(number, one, free)
+                number += 1
+            continue
         item = _item(number, value, free)
-        if is_copied:
+        # The image of a frame is nobody else's.
+        if is_copied and not item.series:
             item = replace(item, payload=defensive_copy(item.payload))
+        number += 1
         # This generator waits for its caller, and must not keep the value alive meanwhile.
         del value
         yield item
         del item
-    if number < 0:
+    if not number:
         raise ScaleError(f"The image set is empty: the {type(images).__name__} gave nothing. Give {_KINDS}.")
 
 
 def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
     if isinstance(value, Item):
         return value
+    if isinstance(value, Frame):
+        token = _only(free, f"item #{number} is one frame")
+        return Item(number, f"#{value.number}", {token: value.image}, _CAMERA, value.number, value.time_s)
     if isinstance(value, Mapping):
         if set(value) != set(free):
             named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))
@@ -288,6 +441,9 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
             raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
         given = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
     given = {token: _file_or_value(value) for token, value in given.items()}
+    frame = next((one for one in given.values() if isinstance(one, VideoFrame)), None)
+    if frame is not None:
+        return _frame_item(number, frame.name, given, frame)
     files = [file for file in given.values() if isinstance(file, Path)]
     # The process that reads it may have another working folder.
     payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
@@ -326,8 +482,8 @@ def read_value(value: Any, cg: CompGraph, token: str) -> Any:
     Parameters
     ----------
     value
-        A value, or the path of an image, of ``.npy`` or of ``.npz``: an archive of one array is that array, of several
-        a dict.
+        A value, a frame of a video, or the path of an image, of ``.npy`` or of ``.npz``: an archive of one array is
+        that array, of several a dict.
     cg, token
         The graph and the token that has the value: they give the order of an image's colours.
 
@@ -338,6 +494,8 @@ def read_value(value: Any, cg: CompGraph, token: str) -> Any:
     ImageFileError
         It can't be read as an image.
     """
+    if isinstance(value, VideoFrame):
+        return value.video.image(value.number, colour_order(cg, token))
     if not is_file(value):
         return value
     path = Path(value)

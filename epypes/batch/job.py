@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from time import perf_counter_ns
 from typing import Any, Final
 
-from epypes.batch.items import Item, frames_of, payload_of
+from epypes.acquisition.video import VideoFrame
+from epypes.batch.items import Item, frames_of, payload_of, read_value
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
 from epypes.errors import EpypesError, ScaleError
+from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
 
@@ -126,7 +128,54 @@ def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
 
 def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorInfo) -> list[Outcome]:
     """Return the outcomes of an item that could not be run, for each of its settings."""
-    return [Outcome(item.number, item.name, setting, error_info=error_info, series=item.series) for setting in settings]
+    return [_blank(item, setting, error_info) for setting in settings]
+
+
+def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:
+    """Return a job with the pixels of its frames of a video, for an executor: this thread decodes them, in order.
+
+    So a video is decoded once, without seeking, and worker processes need neither the file nor its codec.
+
+    Parameters
+    ----------
+    job, cg
+        The job, and the graph, which has the order of colours.
+    of_cases
+        Whether the frames that are run in the place of the item are read, too: they are then in memory together.
+
+    Raises
+    ------
+    ImageFileError
+        A frame is damaged.
+    """
+    item = _with_pixels(job.item, cg)
+    if of_cases and isinstance(item.frames, tuple):
+        item = replace(item, frames=tuple(_with_pixels(frame, cg) for frame in item.frames))
+    return job if item is job.item else replace(job, item=item)
+
+
+def _with_pixels(item: Item, cg: CompGraph) -> Item:
+    if not any(isinstance(value, VideoFrame) for value in item.payload.values()):
+        return item
+    read = {
+        token: read_value(value, cg, token) if isinstance(value, VideoFrame) else value
+        for token, value in item.payload.items()
+    }
+    return replace(item, payload=read)
+
+
+def _blank(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
+    """Return the outcome of an item that has no values."""
+    return Outcome(
+        item.number,
+        item.name,
+        setting,
+        total_ns=total_ns,
+        error_info=error_info,
+        frame=item.frame,
+        time_s=item.time_s,
+        series=item.series,
+    )
 
 
 def _outcome(
@@ -149,8 +198,8 @@ def _outcome(
             run = runner.run_on(payload, job.targets)
     except (Exception, SystemExit) as error:  # whatever a function raises
         if runner.last is None or runner.last is before:
-            (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
-            return replace(failed, total_ns=perf_counter_ns() - start_ns)
+            info = ErrorInfo("", type(error).__name__, str(error))
+            return _blank(item, setting, info, perf_counter_ns() - start_ns)
         run = runner.last
     return _outcome_of(run, job, setting, album)
 
@@ -182,8 +231,10 @@ def _outcome_of(
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
-        item.series,
-        state,
+        series=item.series,
+        state=state,
+        frame=item.frame,
+        time_s=item.time_s,
     )
 
 

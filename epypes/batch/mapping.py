@@ -10,14 +10,25 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.acquisition.video import Video
 from epypes.batch.cache import OutcomeCache, outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
-from epypes.batch.items import Item, SeriesKeys, count_of, detached_runner, holds_its_arrays, items_of, with_series
+from epypes.batch.items import (
+    FileSet,
+    Item,
+    SeriesKeys,
+    count_of,
+    detached_runner,
+    holds_its_arrays,
+    image_set,
+    items_of,
+    with_series,
+)
 from epypes.batch.job import NO_SETTING, Job, SharedStart, State
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, OutcomeSequence, outcomes_frame, outcomes_html
+from epypes.batch.results import Outcome, OutcomeSequence, fixed_columns, outcomes_frame, outcomes_html
 from epypes.batch.series import Done, SeriesRuns, in_parts, whole_series
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
@@ -55,6 +66,7 @@ class MapResult(OutcomeSequence):
     def to_frame(self) -> pd.DataFrame:
         """Return a table: name, failure, the sink tokens, total_ms, and the time of each function in ms.
 
+        Of frames of a video it has frame and time_s after name: the number, from 0, and the time since the first frame.
         Sink tokens that are no numbers, texts or truth values stand there as a short text.
         """
         return outcomes_frame(self.outcomes, self.cg)
@@ -94,7 +106,11 @@ class SweepResult(OutcomeSequence):
         Its columns are name, the hyperparameters that were varied, failure (None, or what failed), the sink tokens,
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
-        varied = {name: [one.setting.get(name) for one in self.outcomes] for name in self.names}
+        taken = fixed_columns(self.outcomes)
+        varied = {
+            f"{name} (hyperparameter)" if name in taken else name: [one.setting.get(name) for one in self.outcomes]
+            for name in self.names
+        }
         return outcomes_frame(self.outcomes, self.runner.cg, varied)
 
     def sheet(self, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Sheet:
@@ -149,9 +165,10 @@ def map_images(
     runner
         Its graph and hyperparameters are used.
     images
-        A folder, a glob, or an iterable of images, paths of image files, or dicts by free source token; read when
-        their turn comes, so that they may be more than fit into memory. A generator may fill one array again and again.
-        In a dict a text stands for itself, unless it has the ending of an image and there is such a file.
+        A folder, a glob, a video (its path, or ``ep.video(path)``), or an iterable of images, frames of ``ep.camera``,
+        paths of image files and videos, or dicts by free source token; read when their turn comes, so that they may be
+        more than fit into memory. A generator may fill one array again and again. In a dict a text stands for itself,
+        unless it has the ending of an image or a video and there is such a file.
     executor
         None: this thread runs the images. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the
@@ -162,11 +179,12 @@ def map_images(
     show
         Tokens of which thumbnails are kept, which the table shows; None: all that have a picture.
     series
-        Of a graph with state (``ep.delay``), how the images are divided into series: a key per image, or a function
-        that is called with an image and returns its key (of a file with its Path, of several free source tokens with a
-        dict): ``series=lambda path: path.parent.name``. Without, all of them are one series. A series is run in order,
-        whatever runs it: it begins with the initial state, each image with the state that the one before has left; one
-        that fails leaves it as it was. Several series are run side by side. The table gets a column of the keys.
+        How the images are divided into series: a key per image, or a function that is called with an image and returns
+        its key (of a file with its Path, of several free source tokens with a dict):
+        ``series=lambda path: path.parent.name``. Without, each video is a series, and so are all other images together.
+        The table gets a column of the keys. A graph with state (``ep.delay``) runs a series in order, wherever there is
+        a worker: it begins with the initial state, and each image with the state that the one before has left; one that
+        fails leaves it as it was. Several series are run side by side.
     store
         A path, a URL or an ep.Store, where outcomes are written as they come. What is there already is not run again,
         unless ``keep`` is given: so a map that was interrupted goes on. Of a graph with state an outcome counts for its
@@ -188,12 +206,15 @@ def map_images(
     Returns
     -------
     MapResult
-        One outcome per image, in order. An image that can't be read or on which a function fails is one with its error.
+        One outcome per image, in order; of a video one per frame, with its number and time. An image that can't be
+        read, a frame that is damaged, and what a function fails on is one with its error.
 
     Raises
     ------
     ScaleError
         The set is empty; an item does not give the free source tokens; the graph or a value can't travel.
+    ImageFileError
+        A video can't be opened; nothing is run then.
     ExecutorBroken
         The executor can't go on.
     PromotionRefused
@@ -380,8 +401,8 @@ class _Batch:
         room: float = _JOBS_PER_WORKER * worker_count(self.executor)
         parts = in_parts(self.settings, int(room))
         # Of what is in memory anyway, or in files, so many are taken that all series begin.
-        is_held = isinstance(self.images, str | Path) or holds_its_arrays(self.images)
-        room = math.inf if is_held and self.series is not None else room
+        is_held = isinstance(self.images, FileSet | Video) or holds_its_arrays(self.images)
+        room = math.inf if is_held else room
         return SeriesRuns(items, parts, state, room, done)
 
     def series_jobs(self, runs: SeriesRuns) -> Iterator[Job | None]:
@@ -418,6 +439,7 @@ def run_items(
     in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
+    images = image_set(images)
     count, is_sweep = count_of(images), kind == "sweep"
     if is_sweep:
         _require_room(runner, settings, shown, count or 1)

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+from epypes.acquisition.files import is_video_name
 from epypes.batch.cache import SearchKey
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
@@ -357,7 +358,7 @@ def _key(objective: _Objective, axes: Sequence[Axis], direction: str, name: str 
 
 def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
     """Return the cases with their labels read."""
-    if isinstance(given, str | Path) and Path(given).suffix != _CASE_FILE:
+    if isinstance(given, str | Path) and Path(given).suffix != _CASE_FILE and not is_video_name(Path(given)):
         if runner.state:
             return (Case(given, name=str(given)),)
         return tuple(Case(item.payload, name=item.name) for item in items_of(given, runner))

@@ -85,6 +85,8 @@ class Outcome:
         Of tokens whose thumbnails were asked for and that have no picture: a text instead.
     series
         The key of the item's series.
+    frame, time_s
+        Of a frame of a video or a camera, its number, from 0, and its time in s since the first one; else None.
     state
         Of a graph with state, what the next item of the series begins with; a map does not keep it.
     """
@@ -99,7 +101,9 @@ class Outcome:
     thumbnails: Mapping[str, Thumbnail] = field(default_factory=dict)
     kept: Mapping[str, Any] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
-    series: Any = None
+    frame: int | None = None
+    time_s: float | None = None
+    series: Any = ""
     state: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -124,8 +128,9 @@ class Outcome:
             for token, shown in data["thumbnails"].items()
         }
         error_info = None if info is None else ErrorInfo(**info)
-        found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting, series=item.series)
-        return replace(found, error_info=error_info, thumbnails=thumbnails)
+        found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting)
+        found = replace(found, error_info=error_info, thumbnails=thumbnails)
+        return replace(found, frame=item.frame, time_s=item.time_s, series=item.series)
 
 
 class OutcomeSequence(Sequence[Outcome]):
@@ -173,7 +178,22 @@ def _scalar(value: Any) -> Any:
     return item if isinstance(item, bool | int | float) else value
 
 
-FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
+_FRAME_COLUMNS: Final = ("frame", "time_s")
+
+
+def fixed_columns(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+    """Return the names of the columns that a table of outcomes has in any case."""
+    return ("name", *_item_columns(outcomes), "failure", "total_ms")
+
+
+def _item_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
+    """Return the columns that there are: of series if there are several or they have keys, of frames, and of times."""
+    columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in _FRAME_COLUMNS}
+    found = {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    series = [outcome.series for outcome in outcomes]
+    # Of the frames of one video the names say it.
+    has_series = len(set(series)) > 1 or ("frame" not in found and any(key != "" for key in series))
+    return {"series": series, **found} if has_series else found
 
 
 def outcomes_frame(
@@ -188,26 +208,24 @@ def outcomes_frame(
     cg
         The graph, which gives the order of sink tokens and functions.
     extra
-        Columns of hyperparameters by name, each with a value per outcome; they stand after ``name``.
+        Columns by name, each with a value per outcome; they stand after ``name``.
 
     Returns
     -------
     pandas.DataFrame
-        ``name``, ``series`` if there are some, the extra columns, ``failure`` (None, or what failed), one column per
-        sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token that is called like another column has
-        `` (token)`` after its name.
+        ``name``, ``series`` if there are some, of frames ``frame`` and ``time_s``, the extra columns, ``failure``
+        (None, or what failed), one column per sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token
+        that is called like another column has `` (token)`` after its name.
     """
+    fixed = fixed_columns(outcomes)
     columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
-    if has_series(outcomes):
-        columns["series"] = object_column([outcome.series for outcome in outcomes])
-    for column, values in extra.items():
-        is_taken = column in columns or column in FIXED_COLUMNS
-        columns[f"{column} (hyperparameter)" if is_taken else column] = object_column(values)
+    columns |= {column: _column(values) for column, values in _item_columns(outcomes).items()}
+    columns |= {column: object_column(values) for column, values in extra.items()}
     columns["failure"] = object_column(
         [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
     )
     for token in cg.sink_tokens:
-        is_taken = token in columns or token in FIXED_COLUMNS
+        is_taken = token in columns or token in fixed
         columns[f"{token} (token)" if is_taken else token] = _column(
             [outcome.values.get(token) for outcome in outcomes]
         )
@@ -215,11 +233,6 @@ def outcomes_frame(
     for function in cg.functions:
         columns[f"{function} ms"] = [outcome.times_ns.get(function, math.nan) / 1e6 for outcome in outcomes]
     return frame_of(columns)
-
-
-def has_series(outcomes: Sequence[Outcome]) -> bool:
-    """Whether outcomes are of series that have keys."""
-    return any(outcome.series is not None for outcome in outcomes)
 
 
 def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
@@ -314,13 +327,14 @@ def _html_cell(cell: HtmlCell, what: str) -> str:
 def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
     """Return a table of outcomes as HTML, with their thumbnails."""
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in outcomes)]
-    of_series = has_series(outcomes)
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
+    has_series, has_times = ("series" in _item_columns(outcomes), "time_s" in _item_columns(outcomes))
     rows = [
         [
             outcome.name,
-            *([value_text(outcome.series)] if of_series else []),
+            *([value_text(outcome.series)] if has_series else []),
+            *([] if not has_times else ["" if outcome.time_s is None else f"{outcome.time_s:.3f} s"]),
             *(outcome.thumbnails.get(token) for token in shown),
             *(value_text(outcome.values[token]) if token in outcome.values else "" for token in sinks),
             duration_text(outcome.total_ns),
@@ -328,8 +342,8 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
         for outcome in outcomes
     ]
     failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
-    head = ["name", *(["series"] if of_series else []), *shown, *sinks, "time"]
-    return html_table(caption, head, rows, failures)
+    times = [*(["series"] if has_series else []), *(["time of the frame"] if has_times else [])]
+    return html_table(caption, ["name", *times, *shown, *sinks, "time"], rows, failures)
 
 
 def value_text(value: Any) -> str:

@@ -355,3 +355,44 @@ def test_a_search_steps_the_state_that_its_metric_does_not_read_itself():
     runner = ep.CompGraphRunner(ep.delay(cg, "total", "before", 0), {"gain": 1})
     result = ep.optimize(runner, "seen", [[1, 2, 3, 4]], 1, ranges={"gain": [1]})
     assert result.best_value == 6.0
+
+
+# -- videos -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def make_video(tmp_path):
+    """Write a grey video of these levels, losslessly."""
+
+    def make(name, levels):
+        writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter_fourcc(*"FFV1"), 25, (64, 48))
+        for level in levels:
+            writer.write(np.full((48, 64, 3), level, np.uint8))
+        writer.release()
+        return tmp_path / name
+
+    return make
+
+
+def test_each_video_is_a_series_of_its_own(runner, make_video, executor):
+    videos = [make_video("a.mkv", (8, 4, 2, 6)), make_video("b.mkv", (9, 5, 3, 7))]
+    assert values(ep.map(runner, videos[0], executor)) == by_hand((8, 4, 2, 6))
+    result = ep.map(runner, videos, executor)
+    assert values(result) == by_hand((8, 4, 2, 6)) + by_hand((9, 5, 3, 7))
+    assert result.to_frame()["series"].nunique() == 2
+    one = ep.map(runner, videos, executor, series=lambda frame: "all")
+    assert values(one) == by_hand((8, 4, 2, 6, 9, 5, 3, 7))
+
+
+def test_a_video_is_one_case(runner, make_video, executor):
+    path = make_video("a.mkv", (8, 4, 2))
+    cases = [ep.Case(path, {"y": 4.0}), ep.Case(ep.video(path)[:2], {"y": 6.0}), ep.Case({"x": path}, {"y": 5.0})]
+    assert list(ep.check(runner, cases, executor).cases.values()) == [True, True, False]
+    assert ep.optimize(runner, "y", path, 1, ranges={"k": [0.5]}, executor=executor).best_value == 4.0
+
+
+def test_a_video_whose_results_are_stored_is_not_run_again(make_video, tmp_path):
+    runner = smoothing()
+    path = make_video("a.mkv", (8, 4, 2))
+    first = ep.map(runner, path, store=tmp_path / "r.sqlite")
+    assert list(ep.map(runner, path, store=tmp_path / "r.sqlite")) == list(first)
