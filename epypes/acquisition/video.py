@@ -91,6 +91,10 @@ class Video(Sequence["Pixels"]):
         """The time of each frame in s since the first frame of the file."""
         return tuple(self._file.time_s(number) for number in self.numbers)
 
+    def time_s(self, place: int) -> float:
+        """Return the time of one frame in s since the first frame of the file."""
+        return self._file.time_s(self.numbers[place])
+
     @property
     def fps(self) -> float:
         """The mean number of frames per second of the file; 0 for a single frame."""

@@ -148,7 +148,7 @@ def test_it_says_how_far_it_has_come(smoothing: Smoothing, panel: Panel, screen:
     screen.tell("image", index=30)
     shown(panel)
     texts = [note["text"] for note in screen.of("note")]
-    assert "Running the frames before frame 31: 30 of 30" in texts
+    assert "Running the frames before this one: 30 of 30" in texts
     assert texts[-1] == ""
 
 

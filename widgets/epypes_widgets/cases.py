@@ -7,7 +7,7 @@ is given up.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from time import monotonic
@@ -140,7 +140,7 @@ def _verdict(outcomes: tuple[CheckOutcome, ...] | None) -> dict[str, str]:
     return {"state": "failed", "text": f"{failures[0].check}: {failures[0].reason}"[:_TEXT_CHARACTERS] + more}
 
 
-def case_payloads(runner: Tunable, cases: Checks) -> tuple[Payload, ...]:
+def case_payloads(runner: Tunable, cases: Checks) -> Sequence[Payload]:
     """Return the inputs of cases as what a panel can be switched to."""
     return payloads(runner, [case.inputs for case, _ in cases], [case.name or "" for case, _ in cases])
 
@@ -153,7 +153,7 @@ def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:
     Raises
     ------
     TypeError
-        There are images too.
+        There are images too, or a case is of a video.
     PayloadError
         It is a service.
     ScaleError, UnknownName
@@ -175,6 +175,9 @@ def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:
     items = items_of((case.inputs for case, _ in prepared), runner)
     read = []
     for item, (case, checks) in zip(items, prepared, strict=True):
+        if item.frame is not None:
+            text = f"{item.name} is a frame of a video, which a panel does not check. Give the video as images, or"
+            raise TypeError(f"{text} frames of it as inputs: ep.Case(video[17]); ep.check checks each frame.")
         labels = {token: _label(value, runner, token) for token, value in (case.expected or {}).items()}
         with_labels = tuple(
             check if check.token is None else replace(check, expected=_label(check.expected, runner, check.token))

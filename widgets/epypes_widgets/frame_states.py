@@ -8,10 +8,12 @@ another frame runs those since the last checkpoint. They count as long as nothin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from time import monotonic
 from typing import Any, Final
 
 from epypes.batch.grid import identity
+from epypes.errors import ImageFileError
 from epypes.graph import subgraph
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import is_array, is_plain_array
@@ -153,10 +155,13 @@ class FrameStates:
         while place < frame:
             if is_superseded():
                 raise Superseded
-            run = self._runner.trial(values, *self.targets, payload=self._payloads[place].values, state=state)
-            place, state = place + 1, run.state
+            # A frame that can't be read leaves the state as it was, as one on which a function fails does.
+            with suppress(ImageFileError):
+                payload = self._payloads[place].values
+                state = self._runner.trial(values, *self.targets, payload=payload, state=state).state
+            place += 1
             known.add(place, state)
             if monotonic() - reported_s >= _REPORT_S:
-                report(f"Running the frames before frame {frame + 1}: {place - first} of {frame - first}")
+                report(f"Running the frames before this one: {place - first} of {frame - first}")
                 reported_s = monotonic()
         return state

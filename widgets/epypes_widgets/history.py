@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -229,13 +230,19 @@ def history_of(runner: Tunable) -> History:
         return _histories.setdefault(runner, History())
 
 
-def changed(before: Entry | None, after: Entry) -> str:
-    """Return what an entry has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; empty for the first."""
+def changed(before: Entry | None, after: Entry, frames: Sequence[int] | None = None) -> str:
+    """Return what an entry has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; empty for the first.
+
+    ``frames``: the numbers of the frames, where the images are those of a video.
+    """
     if before is None:
         return ""
-    # As images are counted on the screen.
-    one, other = ("-" if entry.image is None else entry.image + 1 for entry in (before, after))
-    moved = f"image {one} -> {other}" if one != other else ""
+    # As they are counted on the screen.
+    numbers = range(1, sys.maxsize) if frames is None else frames
+    one, other = (
+        "-" if entry.image is None or entry.image >= len(numbers) else numbers[entry.image] for entry in (before, after)
+    )
+    moved = f"{'image' if frames is None else 'frame'} {one} -> {other}" if one != other else ""
     return ", ".join(filter(None, (change_text(before.values, after.values), moved)))
 
 

@@ -1,16 +1,19 @@
-"""The test images of a panel: payloads that it can be switched to."""
+"""The test images of a panel, or the frames of its video: payloads that it can be switched to."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import PurePath
-from typing import Any, Final
+from pathlib import Path, PurePath
+from typing import Any, Final, overload
 
+from epypes.acquisition.files import is_video_name
+from epypes.acquisition.video import Video
 from epypes.display import encode_image, is_image
 from epypes.errors import PayloadError, UnknownName
 from epypes.graph import colour_order
+from epypes.images import Order
 from epypes.run.guard import is_array
 from epypes_widgets.target import Tunable
 
@@ -38,7 +41,45 @@ class Payload:
     thumbnail: bytes = field(default=b"", repr=False)
 
 
-def payloads(runner: Tunable, images: Iterable[Any], titles: Sequence[str] = ()) -> tuple[Payload, ...]:
+class VideoPayloads(Sequence[Payload]):
+    """The frames of a video as payloads, each read when it is asked for.
+
+    Parameters
+    ----------
+    video
+        Gives the frames.
+    token
+        The one free source token.
+    order
+        The order of its colours.
+    """
+
+    def __init__(self, video: Video, token: str, order: Order) -> None:
+        self.video, self._token, self._order = video, token, order
+
+    def title(self, index: int) -> str:
+        """Return what a frame is called; it is not read."""
+        return f"{self.video.path.name} #{self.video.numbers[index]}, {self.video.time_s(index):.3f} s"
+
+    def index_of(self, image: object) -> int | None:
+        """Return the index of the frame that an array was read from; None if it was from none of these."""
+        number = self.video.number_of(image)
+        return None if number is None or number not in self.video.numbers else self.video.numbers.index(number)
+
+    def __len__(self) -> int:
+        return len(self.video)
+
+    @overload
+    def __getitem__(self, index: int) -> Payload: ...
+    @overload
+    def __getitem__(self, index: slice) -> VideoPayloads: ...
+    def __getitem__(self, index: int | slice) -> Payload | VideoPayloads:
+        if isinstance(index, slice):
+            return VideoPayloads(self.video[index], self._token, self._order)
+        return Payload(self.title(index), {self._token: self.video.image(self.video.numbers[index], self._order)})
+
+
+def payloads(runner: Tunable, images: Any, titles: Sequence[str] = ()) -> Sequence[Payload]:
     """Return what ``tune(runner, images=...)`` was given as payloads.
 
     Parameters
@@ -46,7 +87,8 @@ def payloads(runner: Tunable, images: Iterable[Any], titles: Sequence[str] = ())
     runner
         Its free source tokens are what a payload has values for.
     images
-        Values of the one free source token, or mappings by token. A generator is read to its end.
+        Values of the one free source token, or mappings by token; a generator is read to its end. Or a video, or the
+        path of one, whose frames are read one by one.
     titles
         What they are called; without, their files say it, or their numbers.
 
@@ -60,9 +102,16 @@ def payloads(runner: Tunable, images: Iterable[Any], titles: Sequence[str] = ())
         A free source token has no value, or a value is for a token that is not free.
     UnknownName
         A value is for no token of the graph.
+    ImageFileError
+        The video can't be opened.
     """
-    given = _listed(images)
     free = runner.free_source_tokens
+    if isinstance(images, str | os.PathLike) and is_video_name(Path(images)):
+        images = Video(Path(images).expanduser())
+    if isinstance(images, Video):
+        (token,) = _values(runner, free, images, "A frame of the video")
+        return VideoPayloads(images, token, colour_order(runner.cg, token))
+    given = _listed(images)
     values = [_values(runner, free, item, f"images[{place}]") for place, item in enumerate(given)]
     return tuple(
         Payload(titles[place] if titles else _title(payload, place), payload, _thumbnail(runner, payload))
@@ -86,6 +135,8 @@ def _listed(images: Any) -> list[Any]:
     listed = list(images)
     if not listed:
         raise ValueError("images is empty. Give at least one, or leave it out to tune on the last payload.")
+    if any(isinstance(image, Video) for image in listed):
+        raise TypeError("A video in a list of images. Give it alone, images=video, or frames of it: [*video[::25]].")
     return listed
 
 

@@ -119,6 +119,8 @@ class Messages:
     def _move(self, message: Message) -> None:
         self._tuning.controls.slide(message["places"])
         self._set(message["values"], commit=False)
+        if "image" in message:
+            self._tuning.want_image(int(message["image"]), commit=False)
 
     def _reset(self, message: Message) -> None:
         first, controls = self._tuning.runner.first_hyperparameters, self._tuning.controls.values

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from epypes_widgets.cases import Cases, case_payloads, read_cases
 from epypes_widgets.control_set import ControlSet
 from epypes_widgets.controls import column, controls
 from epypes_widgets.history import StoredHistory, history_of
-from epypes_widgets.images import payloads
+from epypes_widgets.images import Payload, VideoPayloads, payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
@@ -337,18 +337,18 @@ class Panel:
         run = self._session.result
         if run is None:
             return ""
-        index = self._session.image
-        title = "" if index is None else self._session.payloads[index].title
         first = self._runner.first_hyperparameters
-        return static_html(run, self.token, run.hyperparameters, first, image=title, code=self.code())
+        return static_html(run, self.token, run.hyperparameters, first, image=self._session.title, code=self.code())
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
-        images, values = self._session.payloads, json_values(self.values)
+        frames, values = self._session.frames, json_values(self.values)
+        images = self._session.payloads if frames is None else ()
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
             "images": [{"index": index, "title": image.title} for index, image in enumerate(images)],
+            "frames": None if frames is None else {"name": self._session.frames_name, "numbers": _ends(frames)},
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._controls.thresholds.items()],
             "rois": [
@@ -364,6 +364,11 @@ class Panel:
         return content, [image.thumbnail for image in images]
 
 
+def _ends(numbers: range) -> dict[str, int]:
+    """Return the numbers of frames as the view gets them."""
+    return {"start": numbers.start, "step": numbers.step, "count": len(numbers)}
+
+
 def _made_from(cg: CompGraph, token: str) -> list[str]:
     """Return the tokens that depend on a token: on a picture that it has cut out, it means something else."""
     found = {token}
@@ -373,11 +378,17 @@ def _made_from(cg: CompGraph, token: str) -> list[str]:
     return sorted(found)
 
 
+def _searched(given: Sequence[Payload], *, is_series: bool) -> Any:
+    """Return the inputs that a search looks at, of a graph with state those of one case; None without any."""
+    inputs = given.video if isinstance(given, VideoPayloads) else [payload.values for payload in given]
+    return ([inputs] if is_series else inputs) if len(inputs) else None
+
+
 def tune(
     tuned: CompGraphRunner | Connection,
     /,
     *,
-    images: Iterable[Any] | None = None,
+    images: Iterable[Any] | str | Path | None = None,
     cases: Any = None,
     token: str | None = None,
     metric: Any = None,
@@ -395,9 +406,11 @@ def tune(
         has returned: then the picture follows the service's own events, values are set there, with their revision, and
         what other clients set at the same time is never overwritten unseen.
     images
-        Test images to switch between: values of the one free source token, or dicts by token. A service has none. Of a
-        graph with state (``ep.delay``) they are the frames of a sequence: each is shown with the state that runs over
-        all frames before it leave, with the same hyperparameters.
+        Test images to switch between: values of the one free source token, or dicts by token. Or a video, as
+        ``ep.video(path)`` or its path: then the panel has a slider of its frames, each of which is read when it is
+        asked for. A service has none. Of a graph with state (``ep.delay``) they are the frames of a sequence, with a
+        slider too: each is shown with the state that runs over all frames before it leave, from the initial state, with
+        the same hyperparameters. What the delayed tokens do not need is not run on those.
     cases
         A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
         shows whether it passes with the values that were committed last. A service has none.
@@ -435,7 +448,7 @@ def tune(
     UnknownName
         A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
     ScaleError, ImageFileError
-        The cases can't be understood, or the file of an input can't be read.
+        The cases can't be understood, the file of an input can't be read, or the video can't be opened.
     TypeError, ValueError
         There are images and cases; a hint can't be read, or the hyperparameter's value lies outside of it.
     ServiceError
@@ -470,8 +483,7 @@ def tune(
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
     control_set = ControlSet(controls(runner, hints))
-    frames = [payload.values for payload in given]
-    looked_at: list[Any] | None = [case for case, _ in found] or ([frames] if has_state and frames else frames) or None
+    looked_at = [case for case, _ in found] or _searched(given, is_series=has_state)
     search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
     session.begin()
     return Panel(control_set, session, token, found, store, name, search)

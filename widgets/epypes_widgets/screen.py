@@ -198,7 +198,7 @@ class Screen:
             changed_ns,
             self._pictures,
             stale=failed is not None,
-            image=self._session.image_wanted,
+            **self._payload_shown,
             stages=states(failed or run, self.stages),
         )
         self.view.frames.offer(frame)
@@ -239,6 +239,12 @@ class Screen:
             self._reference = None
 
     @property
+    def _payload_shown(self) -> dict[str, Any]:
+        """The index of the payload, and, of a frame of a video, its time in s."""
+        index, video = self._session.image_wanted, self._session.video
+        return {"image": index, "time_s": None if video is None or index is None else video.video.time_s(index)}
+
+    @property
     def _pictures(self) -> set[str]:
         return {stage.token for stage in self.stages if stage.is_picture}
 
@@ -261,6 +267,7 @@ class Screen:
         """Send the last entries; a thumbnail goes to a view once, and is empty from then on."""
         with self._listing:
             entries, current = self._history.entries, self._history.current
+            numbers = self._session.frames
             pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
             pairs = pairs if len(pairs) <= _MAX_ENTRIES else [pairs[0], *pairs[1 - _MAX_ENTRIES :]]
@@ -270,7 +277,7 @@ class Screen:
                     "number": entry.number,
                     "values": json_values(entry.values),
                     "label": entry.label,
-                    "changed": changed(before, entry),
+                    "changed": changed(before, entry, numbers),
                     "current": entry is current,
                 }
                 for before, entry in pairs

@@ -13,7 +13,7 @@ from typing import Any
 
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets.frame_states import FrameStates
-from epypes_widgets.images import Payload, is_alike
+from epypes_widgets.images import Payload, VideoPayloads, is_alike
 from epypes_widgets.target import Tunable
 
 
@@ -39,7 +39,7 @@ class Session:
     """
 
     def __init__(self, runner: Tunable, payloads: Sequence[Payload] = ()) -> None:
-        self.runner, self.payloads = runner, tuple(payloads)
+        self.runner, self.payloads = runner, payloads
         self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
         self.image = self._image_of(runner.last, is_alike)
@@ -92,6 +92,32 @@ class Session:
         """The values of the free source tokens in the last run that completed."""
         run, free = self.result, self.runner.free_source_tokens
         return () if run is None else tuple(_value(run, token) for token in free)
+
+    @property
+    def title(self) -> str:
+        """What the payload of the last run is called; empty if it is not among those that may be chosen."""
+        if self.image is None:
+            return ""
+        video = self.video
+        return self.payloads[self.image].title if video is None else video.title(self.image)
+
+    @property
+    def video(self) -> VideoPayloads | None:
+        """The frames that may be chosen among; None if there is no video."""
+        return self.payloads if isinstance(self.payloads, VideoPayloads) else None
+
+    @property
+    def frames(self) -> range | None:
+        """The numbers of the frames that may be chosen among, of a video or a sequence; None of single images."""
+        video = self.video
+        if video is not None:
+            return video.video.numbers
+        return None if self.states is None else range(len(self.payloads))
+
+    @property
+    def frames_name(self) -> str:
+        """What the frames are of: the name of a video; empty for a sequence."""
+        return "" if self.video is None else self.video.video.path.name
 
     @property
     def notice(self) -> str:
@@ -222,6 +248,10 @@ class Session:
         """Return the index of the payload that a run was computed from."""
         if run is None:
             return None
+        if isinstance(self.payloads, VideoPayloads):
+            # By the arrays that were read: to compare pixels, all frames would have to be decoded.
+            found = (self.payloads.index_of(_value(run, token)) for token in self.runner.free_source_tokens)
+            return next(found, None)
         for index, payload in enumerate(self.payloads):
             if all(is_one(_value(run, token), value) for token, value in payload.values.items()):
                 return index

@@ -115,11 +115,10 @@ class Tuning:
             self.session.want(self.controls.set(values, by_user=by_user))
         self._wanted(commit=commit)
 
-    def want_image(self, index: int) -> None:
+    def want_image(self, index: int, *, commit: bool = True) -> None:
         """Have another payload computed; IndexError if there is none."""
         self.session.want_image(index)
-        self._commits = True
-        self._request()
+        self._wanted(commit=commit)
 
     def look(self, **shown: Any) -> None:
         """Change what is shown and have it computed, live or not; if not, from the values that the runner has."""

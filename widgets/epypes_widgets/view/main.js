@@ -14,7 +14,7 @@ import { outbox } from "./protocol.js";
 import { roiPart } from "./roi.js";
 import { rowsPart } from "./rows.js";
 import { stagePart } from "./stage.js";
-import { filmsPart, historyPart, pinnedPart } from "./strips.js";
+import { filmsPart, historyPart, pinnedPart, videoPart } from "./strips.js";
 
 const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load", "optimise_use"];
 
@@ -108,17 +108,18 @@ function render({ model, el }) {
   const rows = rowsPart(panel, figure);
   const pinned = pinnedPart(panel);
   const films = filmsPart(panel);
+  const video = videoPart(panel);
   const history = historyPart(panel);
   const optimise = optimisePart(panel);
   const foot = footPart(panel);
   const frames = framesPart(panel, stage, failed);
-  const parts = [header, bar, chips, rows, roi, histogram, probe, pinned, films, history, optimise, foot];
+  const parts = [header, bar, chips, rows, roi, histogram, probe, pinned, films, video, history, optimise, foot];
   const all = (method, ...given) => parts.forEach((part) => part[method]?.(...given));
   stage.panByDrags();
   bar.listen(figure, closing.signal);
   figure.append(
     bar.element, chips.element, header.element, stage.element, header.status,
-    histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element, foot.element,
+    video.element, histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element, foot.element,
   );
   el.append(figure);
 
@@ -149,7 +150,7 @@ function render({ model, el }) {
     all("setup", message, buffers);
     // What asks the kernel to compute rests with a panel that is closed; its picture can still be looked at.
     const column = figure.closest(".epypes-panel")?.querySelector(".epypes-controls");
-    const asking = [column, chips.element, pinned.element, films.element, history.element, optimise.element, ...foot.asking];
+    const asking = [column, chips.element, pinned.element, films.element, video.element, history.element, optimise.element, ...foot.asking];
     for (const node of asking) if (node) node.inert = Boolean(message.closed);
   }
 

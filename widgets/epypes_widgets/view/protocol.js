@@ -7,6 +7,9 @@ const REFUSED_MS = 3000;
 /** After that long without a picture the next moves go all the same: the graph is slow, or nothing is to be shown. */
 const PATIENCE_MS = 250;
 
+/** Stands for the frame of a video where values are known by name: no hyperparameter is called so. */
+export const FRAME = Symbol("frame of the video");
+
 /** Lets through what is newest by its number; for messages that replace one another. */
 export function newestOnly() {
   let newest = -Infinity;
@@ -61,9 +64,10 @@ export function questions(ask) {
  * @param {() => number} [now_ms]
  */
 export function outbox(send, later = setTimeout, now_ms = () => performance.now()) {
-  /** Moved, and not yet sent: values by name, places of sliders by the id of their model. */
+  /** Moved, and not yet sent: values by name, places of sliders by the id of their model, the frame of a video. */
   let values = {};
   let places = {};
+  let image = null;
   /** Sent, and not yet committed. */
   let open = {};
   /** Sent, and not yet seen in a frame: a frame that was computed before must not take the value back. */
@@ -73,13 +77,14 @@ export function outbox(send, later = setTimeout, now_ms = () => performance.now(
   let isScheduled = false;
   let isClosed = false;
 
-  const isEmpty = () => isClosed || !(Object.keys(values).length || Object.keys(places).length);
+  const isEmpty = () => isClosed || !(Object.keys(values).length || Object.keys(places).length || image !== null);
 
   function taken() {
-    const moves = { values, places };
+    const moves = { values, places, ...(image === null ? {} : { image }) };
     open = { ...open, ...values };
     values = {};
     places = {};
+    image = null;
     sent_ms = now_ms();
     return moves;
   }
@@ -112,6 +117,12 @@ export function outbox(send, later = setTimeout, now_ms = () => performance.now(
     /** A slider, by the id of its model, is being dragged, and is at this place. */
     slide(model, place) {
       places = { ...places, [model]: place };
+      goOn();
+    },
+    /** The slider of a video is at this frame. */
+    seek(index) {
+      image = index;
+      awaited.set(FRAME, { value: index, at_ms: now_ms() });
       goOn();
     },
     /** A frame has arrived, and the one before is on the screen, which took so long. */
