@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import re
 import shutil
 import subprocess
 import sys
@@ -69,6 +70,10 @@ def appended(x, known):
 def tracked(x, known):
     points = known["points"] if known else []
     return {"points": [*points, cv2.KeyPoint(x, 1.0, 2.0)], "sizes": np.array([np.nan, x]), "ago": float("nan")}
+
+
+def kept(x, before):
+    return {"last": x, "seen": [*before.get("seen", ()), x]}
 
 
 class Model:
@@ -347,3 +352,75 @@ def test_an_initial_value_that_no_run_takes_or_no_expression_makes_is_refused_wi
         else:
             assert "The initial value of 'before' is of type object, and no expression" in str(refused.value)
             assert 'ep.delay(cg, "made", "before", initial=None)' in str(refused.value)
+
+
+# By what keeps something from call to call: a cell that defines `step`, and the line that the reason names.
+KEPT = {
+    "a global": ("N = 0\ndef step(x):\n    global N\n    N += 1\n    return x + N", "'n', 'n_before', initial=0"),
+    "a list": ("SEEN = []\ndef step(x):\n    SEEN.append(x)\n    return x", "'seen', 'seen_before', initial=[]"),
+    "a closure": (
+        "def make():\n    n = 0.0\n    def step(x):\n        nonlocal n\n        n += x\n        return n\n    return step\n"
+        "step = make()",
+        "'n', 'n_before', initial=0.0",
+    ),
+    "a mutable default": (
+        "def step(x, seen=[]):\n    seen.append(x)\n    return x",
+        "'seen', 'seen_before', initial=None",
+    ),
+    "a cache": (
+        "import functools\n@functools.cache\ndef seen():\n    return []\ndef step(x):\n    seen().append(x)\n    return x",
+        "'seen', 'seen_before', initial=None",
+    ),
+    "a background model": (
+        "import cv2\nimport numpy as np\nMODEL = cv2.createBackgroundSubtractorMOG2()\n"
+        "def step(x):\n    return MODEL.apply(np.full((9, 9), x))",
+        "'model', 'model_before', initial=None",
+    ),
+    "an object with a method": (
+        "class Counter:\n    n = 0\n    def step(self, x):\n        self.n += 1\n        return x + self.n\n"
+        "step = Counter().step",
+        "'state', 'state_before', initial=None",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", KEPT)
+def test_state_outside_of_the_graph_is_refused_with_a_line_that_makes_it_a_delay(what, tmp_path):
+    source, line = KEPT[what]
+    runner = ep.CompGraphRunner(ep.CompGraph({"step": cell(source)["step"]}, {"step": ("x", "y")}))
+    runner.run(x=3)
+    with pytest.raises(PromotionRefused) as refused:
+        ep.promote(runner, tmp_path / "kept")
+    (reason,) = refused.value.reasons
+    assert f"cg = ep.delay(cg, {line})." in reason
+
+
+def test_the_line_of_a_refusal_can_be_pasted(tmp_path):
+    text = "SEEN = []\ndef step(x):\n    SEEN.append(x)\n    return sum(SEEN)\n"
+    cg = ep.CompGraph({"step": cell(text)["step"]}, {"step": ("x", "y")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run(x=3)
+    with pytest.raises(PromotionRefused) as refused:
+        ep.promote(runner, tmp_path / "kept")
+    line = re.search(r"cg = ep\.delay\(.*\)", refused.value.reasons[0])[0]
+    step = "def step(x, seen_before):\n    seen = [*seen_before, x]\n    return seen, sum(seen)\n"
+    graph = 'cg = ep.CompGraph({"step": step}, {"step": (("x", "seen_before"), ("seen", "y"))})\n'
+    names = cell(f"import epypes as ep\n{step}{graph}{line}\n")
+    runner = ep.CompGraphRunner(names["cg"])
+    assert [runner.run(x=x)["y"] for x in (3, 4)] == [3, 7]
+    bundle = ep.promote(runner, tmp_path / "kept", outputs=["y"])
+    assert [ep.load(bundle.path).run(x=x)["y"] for x in (3, 4)] == [3, 4]
+
+
+def test_the_state_of_a_runner_is_no_hidden_state_of_the_functions(names, tmp_path):
+    """Arrays, dicts and lists that a run leaves are compared with nothing: only what functions refer to is."""
+    inner = ep.Pipeline("inner", ep.delay(ep.CompGraph({"a": names["kept"]}, {"a": (("x", "b"), "m")}), "m", "b", {}))
+    cg = ep.CompGraph({"inner": inner, "keep": names["kept"]}, {"inner": ("x", "m"), "keep": (("m", "b"), "k")})
+    runner = ep.CompGraphRunner(ep.delay(cg, "k", "b", {}))
+    runner.run(x=1)
+    again = ep.load(ep.promote(runner, tmp_path / "kept").path)
+    for x in range(3):
+        run = again.run(x=x)
+        assert again.rerun()["k"] == run["k"]
+    assert again.state["inner.b"] == {"last": 2, "seen": [0, 1, 2]}
+    assert len(again.state["b"]["seen"]) == 3
