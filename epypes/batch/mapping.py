@@ -280,7 +280,7 @@ def sweep(
     show
         Tokens of which thumbnails are made; None: all that have a picture. Of others a text is kept.
     series
-        As for ``map``: of a graph with state each series is run with each setting, from its beginning.
+        As for ``map``: of a graph with state each series is run whole with each setting, from its beginning.
     store, name
         As for ``map``: settings that are stored already are not run again.
     progress

@@ -19,7 +19,7 @@ from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
 from epypes.batch.cache import graph_fingerprint
-from epypes.batch.items import Item, payload_of
+from epypes.batch.items import Item, frames_of, payload_of
 from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
@@ -81,7 +81,7 @@ def package_of(runner: CompGraphRunner, item: Item) -> PackagedGraph | None:
         return _PACKAGES[key]
     own = clone_runner(runner)
     try:
-        own.run_on(payload_of(item, own.cg))
+        own.run_on(payload_of(next(frames_of(item, own)), own.cg))
     except (Exception, SystemExit):  # whatever a function raises: it will be that item's failure
         return None
     with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.errors import PayloadError, ScaleError
+from epypes.errors import PayloadError, PromotionRefused, ScaleError
 from tests.bundle.cells import cell
 
 SOURCE = """
@@ -238,6 +238,7 @@ def test_an_item_counts_for_all_that_came_before_it(noted, calls, tmp_path):
     ep.map(noted, [1, 2, 3], **options)
     assert values(ep.map(noted, [5, 2, 3], **options)) == [5, 7, 10]
     assert values(ep.map(noted, [1, 2, 3], **options)) == [1, 3, 6]
+    assert values(ep.map(noted, [5, 2, 3], **options)) == [5, 7, 10]
     assert calls == [1, 2, 3, 5, 2, 3]
     assert values(ep.map(noted, [1, 2, 3, 4], **options)) == [1, 3, 6, 10]
 
@@ -355,6 +356,48 @@ def test_a_search_steps_the_state_that_its_metric_does_not_read_itself():
     runner = ep.CompGraphRunner(ep.delay(cg, "total", "before", 0), {"gain": 1})
     result = ep.optimize(runner, "seen", [[1, 2, 3, 4]], 1, ranges={"gain": [1]})
     assert result.best_value == 6.0
+
+
+class CountingExecutor(Executor):
+    """Hands calls on, and counts them."""
+
+    def __init__(self, executor):
+        self.executor, self.count = executor, 0
+
+    def submit(self, call, /, *args, **kwargs):
+        self.count += 1
+        return self.executor.submit(call, *args, **kwargs)
+
+
+@pytest.mark.slow
+def test_cases_are_run_in_the_processes_that_are_given(runner, processes):
+    counting = CountingExecutor(processes)
+    assert ep.check(runner, [ep.Case([8.0, 4.0], {"y": 6.0}), ep.Case([2.0], {"y": 2.0})], counting)
+    assert counting.count >= 2
+
+
+def test_a_state_that_can_not_travel_is_refused_with_the_way_out(processes):
+    made = cell("""
+class Track:
+    def __init__(self, count):
+        self.count = count
+
+
+def follow(x, before):
+    return Track(x if before is None else before.count + x)
+
+
+def count(track):
+    return track.count
+""")
+    cg = ep.CompGraph(
+        {"follow": made["follow"], "count": made["count"]},
+        {"follow": (("x", "before"), "track"), "count": ("track", "n")},
+    )
+    runner = ep.CompGraphRunner(ep.delay(cg, "track", "before"))
+    assert [outcome.values["n"] for outcome in ep.map(runner, [1, 2, 3])] == [1, 3, 6]
+    with pytest.raises((ScaleError, PromotionRefused), match="Track"):
+        ep.map(runner, [1, 2, 3], processes)
 
 
 # -- videos -----------------------------------------------------------------------------------------------------
