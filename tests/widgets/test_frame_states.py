@@ -143,6 +143,34 @@ def test_a_newer_frame_is_not_kept_waiting_by_the_frames_before_an_older_one(
     assert screen.frames[-1]["image"] == 3
 
 
+def test_what_is_to_be_run_is_not_lost_when_a_cell_changes_the_runner_meanwhile(
+    smoothing: Smoothing, panel: Panel, screen: FrontEnd
+) -> None:
+    has_begun, may_go_on = threading.Event(), threading.Event()
+
+    def wait(x: float) -> None:
+        has_begun.set()
+        assert may_go_on.wait(_WAIT_S)
+
+    screen.tell("live", on=False)
+    panel.wait(_WAIT_S)
+    smoothing.before_call = wait
+    screen.tell("image", index=12)
+    screen.tell("run")
+    assert has_begun.wait(_WAIT_S)
+    smoothing.runner["gain"] = 2.0
+    may_go_on.set()
+    assert shown(panel) == pytest.approx(smoothing.y(12, gain=2.0))
+
+
+def test_the_runner_has_the_state_after_the_frame_whatever_is_looked_at(smoothing: Smoothing) -> None:
+    panel = tune(smoothing.runner, images=smoothing.frames, token="image")
+    panel._tuning.want_image(9)
+    panel.wait(_WAIT_S)
+    panel.close(_WAIT_S)
+    assert smoothing.runner.run(image=smoothing.frames[10])["y"][0, 0] == pytest.approx(smoothing.y(10))
+
+
 def test_it_says_how_far_it_has_come(smoothing: Smoothing, panel: Panel, screen: FrontEnd, monkeypatch: Any) -> None:
     monkeypatch.setattr("epypes_widgets.frame_states._REPORT_S", 0.0)
     screen.tell("image", index=30)
