@@ -51,5 +51,18 @@ def with_durations(path: Path, durations: list[int]) -> Path:
         size_at = content.index(box) - 4
         size = int.from_bytes(content[size_at : size_at + 4]) + len(table) - old
         content = content[:size_at] + struct.pack(">I", size) + content[size_at + 4 :]
+    # Without its edit list, which says how long the video is.
+    path.write_bytes(content.replace(b"edts", b"free", 1))
+    return path
+
+
+def with_damage(path: Path, number: int) -> Path:
+    """Zero the bytes of a frame of an .avi."""
+    content = bytearray(path.read_bytes())
+    at = content.index(b"movi")
+    for _ in range(number + 1):
+        at = content.index(b"00dc", at + 1)
+    size = int.from_bytes(content[at + 4 : at + 8], "little")
+    content[at + 8 : at + 8 + size] = bytes(size)
     path.write_bytes(content)
     return path

@@ -252,10 +252,12 @@ def _index_of(path: Path) -> _Index:
     with _opened(path) as (container, stream):
         pts: set[int] = set()
         keys: set[int] = set()
-        end_s, is_cut = 0.0, False
+        end_s, is_cut, packets = 0.0, False, 0
         try:
             for packet in container.demux():
                 stamp = packet.dts if packet.pts is None else packet.pts
+                # An .avi has empty packets where a frame was dropped; the last one of any file is empty, too.
+                packets += packet.stream is stream and (packet.size > 0 or stamp is not None)
                 if not packet.size:
                     continue
                 if stamp is not None and packet.time_base is not None:
@@ -279,7 +281,7 @@ def _index_of(path: Path) -> _Index:
             raise ImageFileError(str(path), f"Video {str(path)!r} has no frames. Record it again.")
         announced_s = (container.duration or 0) / av.time_base
         lasts_s = end_s - (container.start_time or 0) / av.time_base
-        is_cut = is_cut or announced_s > lasts_s + max(_MISSING_S, announced_s / 100)
+        is_cut = is_cut or stream.frames > packets or announced_s > lasts_s + max(_MISSING_S, announced_s / 100)
         has = f"{len(pts):,} of {stream.frames:,} frames" if stream.frames > len(pts) else f"{lasts_s:.1f} s of video"
         return _Index(tuple(sorted(pts)), tuple(sorted(keys)), float(stream.time_base or 0), has if is_cut else "")
 
@@ -395,7 +397,8 @@ class _VideoFile:
         self._damaged: set[int] = set()
         self._kept: OrderedDict[int, Any] = OrderedDict()
         if index.missing:
-            warn(f"{str(path)!r} was cut off: it has {index.missing}. These are used.", UserWarning, stacklevel=3)
+            text = f"{str(path)!r} was cut off or is damaged: it has {index.missing}. These are used."
+            warn(text, UserWarning, stacklevel=3)
 
     def time_s(self, number: int) -> float:
         """Return the time of a frame since the first one."""

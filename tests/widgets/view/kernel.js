@@ -147,7 +147,7 @@ function histogram(names = ["gray"]) {
 /** Everything that a test may look at or change. */
 const kernel = {
   sent: [], values: structuredClone(DEFAULTS), token: "edges", pinned: [], seq: 0, isHistogramOn: false, compared: null, live: true,
-  overlay: null, isQuiet: false, entries: [{ number: 0, values: {}, label: "#0", changed: "", current: true }], image: 0,
+  overlay: null, isQuiet: false, entries: [{ number: 0, values: {}, label: "#0", changed: "", current: true }], image: 0, video: null,
   defaults: DEFAULTS, bytesOf, pictureOf, histogram, size: SIZE,
   listeners: new Set(),
   models: {},
@@ -162,7 +162,7 @@ const kernel = {
       : { ...pictureOf(kernel.token, "main"), overlay: kernel.overlay };
     const message = {
       kind: "frame", seq: kernel.seq, token: kernel.token, values: structuredClone(kernel.values), compute_ms: 2.13, to_screen_ms: 31,
-      times_ms: { crop: 0.2, blur: 1.1, canny: 0.8 }, ran: 3, reused: 1, stale: false, image: kernel.image, pictures: [main],
+      times_ms: { crop: 0.2, blur: 1.1, canny: 0.8 }, ran: 3, reused: 1, stale: false, image: kernel.image, time_s: kernel.video && kernel.image / 25, pictures: [main],
       stages: Object.fromEntries(STAGES.map((token) => [token, "fresh"])),
       histogram: kernel.isHistogramOn && !isText ? histogram(kernel.token === "image" ? ["B", "G", "R"] : ["gray"]) : null,
       histograms: kernel.isHistogramOn ? { blurred: histogram() } : {},
@@ -220,10 +220,10 @@ function setValues(values) {
 
 const answers = {
   async ready() {
-    const images = [{ index: 0, title: "coffee" }, { index: 1, title: "coins" }];
+    const images = kernel.video ? [] : [{ index: 0, title: "coffee" }, { index: 1, title: "coins" }];
     kernel.deliver({
       kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images,
-      live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
+      video: kernel.video, live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
       promote_to: "services/edges", settings: ["good", "dark"], token: kernel.token, pinned: [], closed: false,
     }, [await bytesOf("image", 96), await bytesOf("gray", 96)]);
     await kernel.remember();
@@ -232,7 +232,8 @@ const answers = {
   painted({ move }) {
     if (move) answers.move(move);
   },
-  async move({ values, places }) {
+  async move({ values, places, image }) {
+    kernel.image = image ?? kernel.image;
     const slid = Object.entries(places).map(([model, place]) => {
       const { names } = ROWS.find((row) => row.model === model);
       return Object.fromEntries(names.map((name, i) => [name, [place].flat()[i]]));

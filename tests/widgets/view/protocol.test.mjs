@@ -2,7 +2,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { failures, withBytes } from "../../../widgets/epypes_widgets/view/frames.js";
-import { newestNext, newestOnly, outbox, questions } from "../../../widgets/epypes_widgets/view/protocol.js";
+import { FRAME, newestNext, newestOnly, outbox, questions } from "../../../widgets/epypes_widgets/view/protocol.js";
 
 test("an error stays until a better frame comes", () => {
   const order = failures();
@@ -142,4 +142,21 @@ test("an undo may give back any value", () => {
 test("bytes belong to the pictures in order, and texts have none", () => {
   const pictures = ["image/jpeg", "text/plain", "image/png"].map((media_type) => ({ media_type }));
   assert.deepEqual(withBytes(pictures, ["a", "b"]).map(({ bytes }) => bytes), ["a", undefined, "b"]);
+});
+
+test("a video's slider goes with the moves, the newest frame next, and is not taken back by an older picture", () => {
+  const sent = [];
+  let now_ms = 0;
+  const out = outbox((content) => sent.push(content), () => undefined, () => now_ms);
+  out.seek(3);
+  out.seek(4);
+  out.seek(5);
+  assert.deepEqual(sent, [{ kind: "move", values: {}, places: {}, image: 3 }]);
+  out.painted(1);
+  assert.deepEqual(sent[1], { kind: "painted", seq: 1, move: { values: {}, places: {}, image: 5 } });
+  assert.ok(!out.takes(FRAME, 3));
+  assert.ok(out.takes(FRAME, 5));
+  assert.ok(out.takes(FRAME, 9));
+  out.painted(2);
+  assert.deepEqual(sent[2], { kind: "painted", seq: 2 });
 });

@@ -143,6 +143,8 @@ export function videoPart(panel) {
   }
 
   slider.addEventListener("input", () => go(slider.valueAsNumber));
+  // JupyterLab's notebook would take them for itself.
+  slider.addEventListener("keydown", (event) => event.key.startsWith("Arrow") && event.stopPropagation());
   return {
     element: root,
     setup(message) {
