@@ -101,7 +101,7 @@ def runs_here(executor: Executor | None) -> bool:
 def _run_here(runner: CompGraphRunner, jobs: Iterable[Job | None], stop: threading.Event) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
     for job in () if stop.is_set() else jobs:
-        for outcome in run_job(own, job) if job is not None else ():
+        for outcome in run_job(own, job, stop.is_set) if job is not None else ():
             yield [outcome]
             if stop.is_set():
                 return
@@ -255,10 +255,13 @@ class _Threads:
 
     def _run(self, job: Job) -> list[Outcome]:
         outcomes: list[Outcome] = []
-        waiting = run_job(branched(self._runner), job)
-        while not any(stop.is_set() for stop in self._stops) and (outcome := next(waiting, None)) is not None:
+        waiting = run_job(branched(self._runner), job, self._is_over)
+        while not self._is_over() and (outcome := next(waiting, None)) is not None:
             outcomes.append(outcome)
         return outcomes
+
+    def _is_over(self) -> bool:
+        return any(stop.is_set() for stop in self._stops)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""

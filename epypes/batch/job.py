@@ -54,7 +54,7 @@ class Job:
     states: tuple[State, ...] = ()
 
 
-def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
+def run_job(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool] = lambda: False) -> Iterator[Outcome]:
     """Yield the outcomes of a job, setting by setting.
 
     Parameters
@@ -64,25 +64,36 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     job
         The item and its settings. Of the second setting on only what depends on what changed is run, unless the graph
         has state between runs.
+    is_over
+        Is asked before each frame of a case whether it is to end there, without an outcome.
     """
     has_state = job.states or job.item.frames is not None
-    return _run_with_state(runner, job) if has_state else _run_without_state(runner, job)
+    return _run_with_state(runner, job, is_over) if has_state else _run_without_state(runner, job)
 
 
-def _run_with_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
+def _run_with_state(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool]) -> Iterator[Outcome]:
     """Run the item, or its frames one after another, from the beginning for each setting; give the last outcomes."""
     for place, setting in enumerate(job.settings):
-        yield _outcome_with_state(runner, job, setting, job.states[place] if job.states else {})
+        outcome = _outcome_with_state(runner, job, setting, job.states[place] if job.states else {}, is_over)
+        if outcome is None:
+            return
+        yield outcome
 
 
-def _outcome_with_state(runner: CompGraphRunner, job: Job, setting: Setting, state: State) -> Outcome:
+def _outcome_with_state(
+    runner: CompGraphRunner, job: Job, setting: Setting, state: State, is_over: Callable[[], bool]
+) -> Outcome | None:
     item, total_ns, last = job.item, 0, None
     try:
         for place, frame in enumerate(frames_of(item, runner)):
+            if is_over():
+                return None
             last = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
             total_ns += last.report.total_ns
             state = last.state
             if last.failure is not None:
+                if not isinstance(last.failure.exception, Exception | SystemExit):  # Ctrl+C ends the map
+                    raise last.failure.exception
                 where = "" if item.frames is None else f" (frame {place}: {frame.name})"
                 return _outcome_of(last, job, setting, Album(), total_ns, state, where)
         if last is None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import weakref
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -178,6 +180,35 @@ def test_keys_of_a_graph_without_state_are_a_column_only():
     assert frame[["series", "y"]].to_numpy().tolist() == [["a", 2], ["b", 4]]
 
 
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_long_series_is_never_in_memory_as_a_whole(threads):
+    alive, most = set(), 0
+
+    def frames():
+        nonlocal most
+        for number in range(200):
+            frame = np.full((10, 10), number % 7, np.uint8)
+            alive.add(number)
+            weakref.finalize(frame, alive.discard, number)
+            most = max(most, len(alive))
+            yield frame
+            del frame
+
+    cg = ep.CompGraph({"add": lambda x, t: t + int(x[0, 0])}, {"add": (("x", "before"), "total")})
+    runner = ep.CompGraphRunner(ep.delay(cg, "total", "before", 0))
+    gc.disable()
+    try:
+        if threads:
+            with ThreadPoolExecutor(threads) as pool:
+                result = ep.map(runner, frames(), pool)
+        else:
+            result = ep.map(runner, frames())
+    finally:
+        gc.enable()
+    assert result[-1].values["total"] == sum(number % 7 for number in range(200))
+    assert most <= (4 if not threads else 20)
+
+
 # -- sweeps -----------------------------------------------------------------------------------------------------
 
 
@@ -255,6 +286,17 @@ def test_an_interrupted_series_is_run_from_its_beginning(noted, calls, tmp_path,
     calls.clear()
     assert values(ep.map(noted, [1, 2, 10, 20, 30], **options)) == [1, 3, 10, 30, 60]
     assert calls == [10, 20, 30]
+
+
+def test_an_interrupt_within_a_function_ends_the_map():
+    def interrupted(x, before):
+        if x == 2:
+            raise KeyboardInterrupt
+        return x
+
+    cg = ep.CompGraph({"f": interrupted}, {"f": (("x", "before"), "y")})
+    with pytest.raises(KeyboardInterrupt):
+        ep.map(ep.CompGraphRunner(ep.delay(cg, "y", "before")), [1, 2, 3])
 
 
 def test_of_a_generator_everything_is_run(noted, calls, tmp_path):
@@ -339,6 +381,26 @@ def test_a_search_runs_whole_series(runner, executor, tmp_path):
     }
     assert runner.last is None
     assert len(ep.optimize(runner, "y", [[8.0, 4.0, 0.0], [6.0, 2.0]], 12, **options)) == 12
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_search_that_is_stopped_does_not_wait_for_the_end_of_a_sequence(threads):
+    stop, calls = threading.Event(), []
+
+    def add(x, before, gain):
+        calls.append(x)
+        if x == 3:
+            stop.set()
+        return before + gain * x
+
+    cg = ep.CompGraph({"add": add}, {"add": (("x", "before", "gain"), "total")})
+    runner = ep.CompGraphRunner(ep.delay(cg, "total", "before", 0), {"gain": 1})
+    with ThreadPoolExecutor(threads or 1) as pool:
+        executor = pool if threads else None
+        found = ep.optimize(runner, "total", [range(1000)], 50, ranges={"gain": (0, 5)}, executor=executor, stop=stop)
+    assert found.was_stopped
+    assert len(found) == 0
+    assert max(calls) == 3
 
 
 def test_a_folder_is_one_case_of_a_search(runner, tmp_path):
