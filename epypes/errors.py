@@ -55,6 +55,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from epypes.deprecation import OldNames
+from epypes.wording import keep_as_state
 
 if TYPE_CHECKING:
     from epypes.bundle.replay import ReplayReport
@@ -235,7 +236,7 @@ class StateChanged(EpypesError, RuntimeError):
         )
         super().__init__(
             f"Function {function!r} changed {changed!r}, which outlives the call. {became}. "
-            "Change a copy of it, or make it a token."
+            f"Change a copy of it. {keep_as_state(changed, is_object=not is_restored)}."
         )
 
 

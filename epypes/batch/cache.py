@@ -2,7 +2,8 @@
 
 A series in a store is of one graph and of the hyperparameters that don't vary. Its name is the one that the user gives,
 or the digest of both. An outcome's key is the item's name and content, the values that vary, the tokens that are shown,
-and the state of the lists, arrays and objects that functions use. What can't be digested is never taken from the store.
+and the state of the lists, arrays and objects that functions use; of a graph with state between runs also the content
+of all items before it in its series. What can't be digested is never taken from the store.
 The trials of a search are those of a study, whose name is given or digested too; it has no keys. No other module
 decides what a result of a map, a sweep or a search is stored under.
 """
@@ -10,7 +11,7 @@ decides what a result of a map, a sweep or a search is stored under.
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,7 @@ from weakref import WeakKeyDictionary
 
 from epypes.acquisition.video import Video, VideoFrame
 from epypes.batch.cases import Case
-from epypes.batch.items import Item
+from epypes.batch.items import Item, frames_of
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
 from epypes.bundle.fingerprint import Digester, combined_digest, file_digest, versions_of
@@ -138,6 +139,13 @@ def payload_digest(payload: Mapping[str, Any]) -> str:
     return combined_digest("payload", *parts).hex()
 
 
+def _content_digest(item: Item, runner: CompGraphRunner) -> str:
+    """Return the digest of an item's payload, or of those of its frames; NoDigest as `payload_digest`."""
+    if item.frames is None:
+        return payload_digest(item.payload)
+    return combined_digest("frames", *(payload_digest(frame.payload) for frame in frames_of(item, runner))).hex()
+
+
 # Of videos that are open, since each of their frames asks for it.
 _VIDEO_DIGESTS: Final[WeakKeyDictionary[Video, str]] = WeakKeyDictionary()
 
@@ -229,7 +237,7 @@ class SearchKey:
         }
         data: dict[str, Callable[[], str]] = {
             "hyperparameters": lambda: value_digest((fixed, choices)),
-            "inputs of the cases": lambda: value_digest([(item.name, payload_digest(item.payload)) for item in items]),
+            "inputs of the cases": lambda: value_digest([(item.name, _content_digest(item, runner)) for item in items]),
             "labels of the cases": lambda: value_digest(labels),
         }
         self.about = {**readable, **_digests({**self._code, **data}, is_named=bool(name))}
@@ -283,6 +291,8 @@ def outcome_cache(
     keep: Sequence[str] = (),
     show: Sequence[str] | None = (),
     settings: Sequence[Mapping[str, Any]],
+    state: Mapping[str, Any] | None = None,
+    is_read: bool = True,
 ) -> Iterator[OutcomeCache | None]:
     """Open the series of a runner's outcomes; what waits to be written is written at the end.
 
@@ -302,6 +312,10 @@ def outcome_cache(
         Tokens of which thumbnails are made.
     settings
         The hyperparameters of which each outcome has its own values, by token.
+    state
+        What each series of items begins with; None of a graph without state between runs.
+    is_read
+        Whether outcomes may be taken from the store.
 
     Warns
     -----
@@ -328,7 +342,8 @@ def outcome_cache(
         if doubt:
             warn(doubt, stacklevel=5)
         shown = "" if show == () else f"show={show and list(show)}"
-        cache = OutcomeCache(series, settings, f"{shown} state={found.state}", reads=not keep and not doubt)
+        reads = is_read and not keep and not doubt
+        cache = OutcomeCache(series, settings, f"{shown} state={found.state}", reads=reads, state=state)
         try:
             yield cache
         except BaseException as error:  # that is what is raised, whatever the store does
@@ -397,14 +412,23 @@ class OutcomeCache:
         What else than the item and its setting decides about an outcome.
     reads
         Whether outcomes are taken from the series.
+    state
+        What each series of items begins with; None of a graph without state between runs.
 
     Notes
     -----
-    An item whose content can't be digested is run each time, and not written.
+    An item whose content can't be digested is run each time, and not written; of a graph with state, neither are those
+    after it in its series.
     """
 
     def __init__(
-        self, series: Series, settings: Sequence[Mapping[str, Any]], suffix: str = "", *, reads: bool = True
+        self,
+        series: Series,
+        settings: Sequence[Mapping[str, Any]],
+        suffix: str = "",
+        *,
+        reads: bool = True,
+        state: Mapping[str, Any] | None = None,
     ) -> None:
         self._series, self._settings, self._suffix = series, settings, suffix
         self._known = series.keys() if reads else frozenset()
@@ -412,11 +436,30 @@ class OutcomeCache:
         self._keys: dict[tuple[int, int], str] = {}
         self._waiting: list[tuple[str, dict[str, Any]]] = []
         self._written_s = monotonic()
+        self._state = state
+        # Of each series of items, the digest of those that were looked for and of the state before them; "" if one has
+        # none.
+        self._prefixes: dict[Hashable, str] = {}
+
+    @property
+    def has_outcomes(self) -> bool:
+        """Whether there are outcomes that can be taken."""
+        return bool(self._known)
+
+    def noting(self, items: Iterable[Item]) -> Iterator[Item]:
+        """Yield items that are all to be run; their outcomes can then be added."""
+        for item in items:
+            self.found(item)
+            yield item
+            del item
 
     def found(self, item: Item) -> list[Outcome | None]:
-        """Return the stored outcomes of an item, by setting; None for those that have to be run."""
+        """Return the stored outcomes of an item, by setting; None for those that have to be run.
+
+        Of a graph with state, the items of a series are to be looked for in their order.
+        """
         try:
-            of_item = f"{item.name} {payload_digest(item.payload)} {self._suffix}"
+            of_item = f"{item.name} {self._digest_of(item)} {self._suffix}"
         except NoDigest:
             return [None for _ in self._settings]
         outcomes: list[Outcome | None] = []
@@ -427,6 +470,23 @@ class OutcomeCache:
             if label and stored is None:
                 self._keys[item.number, id(setting)] = key
         return outcomes
+
+    def _digest_of(self, item: Item) -> str:
+        """Return the digest of what decides about an item's outcome: its payload, and with state those before it.
+
+        Raises
+        ------
+        NoDigest
+            One of these has none.
+        """
+        if self._state is None:
+            return payload_digest(item.payload)
+        before, self._prefixes[item.series] = self._prefixes.get(item.series), ""
+        before = value_digest(dict(self._state)) if before is None else before
+        if not before:
+            raise NoDigest("an item before it in its series")
+        self._prefixes[item.series] = digest = combined_digest("item", before, payload_digest(item.payload)).hex()
+        return digest
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes of items that had to be run."""

@@ -6,7 +6,8 @@ A check is a metric, of one token or of the whole run, with its bounds. The file
 
     [[case]]
     name = "left"                        # without: the name of its first file, or its number
-    inputs = {image = "left.png"}        # by free source token; a value alone is that of the one free source token
+    inputs = {image = "left.png"}        # by free source token; a value alone is that of the one free source token;
+                                         # of a graph with state a list of these, or a folder or glob of images
     hyperparameters = {canny_lo = 90}    # values that differ from the bundle's in this case
 
     [[case.check]]
@@ -45,8 +46,9 @@ from typing import Any, Final
 
 from epypes.acquisition.files import is_video_name
 from epypes.acquisition.video import Video, VideoFrame
-from epypes.batch.items import by_frame, defensive_copy, holds_its_arrays, is_file, read_value
+from epypes.batch.items import by_frame, defensive_copy, holds_its_arrays, is_file, is_one_image, read_value
 from epypes.batch.metrics import METRICS
+from epypes.batch.results import short_text
 from epypes.bundle.settings import decode_value
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
@@ -112,7 +114,10 @@ class Case:
     inputs
         By free source token: a value, or the path of its file; a text is a path if it ends like an image, ``.npy`` or
         ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token. A video, or
-        the path of one, stands for a case per frame, each with the same checks.
+        the path of one, stands for a case per frame, each with the same checks. Of a graph with state (``ep.delay``) a
+        case is a sequence: of these, a folder or glob of images, or a video. They are run one after another from the
+        initial state, and what the last one gives is measured; if one fails, the case has failed. What is to count over
+        all of them is a token with state itself, such as a sum. One image is a series of one.
     expected
         By token: the value that it must have, or the path of a file that holds it (an image, ``.npy`` or ``.npz``);
         a text with such an ending is a path. Where no function and no metric that compares looks at a token, it must
@@ -186,7 +191,7 @@ class Case:
         return f"<Case{name}: {number} check{'s' * (number != 1)}>"
 
 
-def cases_of(given: Any) -> tuple[Case, ...]:
+def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
     """Return cases, each with a name that no other has.
 
     Parameters
@@ -194,27 +199,32 @@ def cases_of(given: Any) -> tuple[Case, ...]:
     given
         The path of a CASES.toml; an iterable of cases, of dicts with a case's parts, or of inputs alone; or a video, or
         the path of one, of which each frame is a case. A case with a video becomes one per frame.
+    are_series
+        Whether the graph has state, so that the inputs of a case are a sequence: a video is one case.
 
     Raises
     ------
     ScaleError
-        There is none, or one is not a case.
+        There is none, or one is not a case; or of a graph with state, one is an image alone.
     ImageFileError
         A video can't be opened.
     """
     if isinstance(given, Video) or (isinstance(given, str | os.PathLike) and is_video_name(Path(given))):
         found = [Case(given)]
     elif isinstance(given, str | os.PathLike):
-        found = _read_file(Path(given))
+        found = _read_file(Path(given), are_series)
     elif isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(
             f"cases is a list of cases or the path of a file of them, not a single {type(given).__name__!r}."
         )
     else:
-        found = [_case(item) if holds_its_arrays(given) else _copied(_case(item)) for item in given]
+        found = [
+            _case(item, are_series) if holds_its_arrays(given) else _copied(_case(item, are_series)) for item in given
+        ]
     if not found:
         raise ScaleError("There are no cases. Give at least one: ep.Case(inputs, expected={...}).")
-    found = [one for case in found for one in _by_frame(case)]
+    if not are_series:
+        found = [one for case in found for one in _by_frame(case)]
     taken: dict[str, int] = {}
     return tuple(
         replace(case, name=_unique(case.name or _file_name(case.inputs) or f"#{number}", taken))
@@ -267,12 +277,17 @@ def with_labels_read(case: Case, cg: CompGraph) -> Case:
     return replace(case, expected=read or case.expected)
 
 
-def _case(item: Any) -> Case:
+def _case(item: Any, is_series: bool) -> Case:
     if isinstance(item, Case):
         return item
     parts = {part.name for part in fields(Case)}
     if isinstance(item, Mapping) and "inputs" in item and parts.issuperset(item):
         return Case(**item)
+    if is_series and is_one_image(item):
+        raise ScaleError(
+            f"The graph has state between runs, so a case is a sequence of images, and {short_text(item)} is a single "
+            "one. For one series of them all write [[...]]; for a case of one image ep.Case(image)."
+        )
     return Case(item)
 
 
@@ -404,7 +419,7 @@ def _resolved(check: Check, case: Case, cg: CompGraph) -> Check:
 # -- CASES.toml -------------------------------------------------------------------------------------------------
 
 
-def _read_file(path: Path) -> list[Case]:
+def _read_file(path: Path, are_series: bool) -> list[Case]:
     """Return the cases in a file, in their order; no file that they name is read.
 
     Raises
@@ -435,7 +450,7 @@ def _read_file(path: Path) -> list[Case]:
     cases = []
     for table, line in zip(tables, lines, strict=True):
         try:
-            cases.append(_case_of_table(table, path.parent))
+            cases.append(_case_of_table(table, path.parent, are_series))
         except (EpypesError, ValueError) as error:
             reasons.append(f"{path.name}, line {line}: {error}")
     if reasons:
@@ -443,7 +458,7 @@ def _read_file(path: Path) -> list[Case]:
     return cases
 
 
-def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
+def _case_of_table(table: Mapping[str, Any], folder: Path, is_series: bool) -> Case:
     name, checks = table.get("name"), table.get("check", [])
     where = f"in case {name!r:.{_VALUE_CHARACTERS}}" if name else "in this case"
     for key in table:
@@ -469,7 +484,9 @@ def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
     values = table.get("hyperparameters")
     if isinstance(values, Mapping):
         values = {token: _hyperparameter(token, entry) for token, entry in values.items()}
-    return Case(_in_folder(table["inputs"], folder, has_videos=True), expected, metrics, name, values)
+    given = table["inputs"]
+    inputs = _series_in_folder(given, folder) if is_series else _in_folder(given, folder, has_videos=True)
+    return Case(inputs, expected, metrics, name, values)
 
 
 def _in_folder(value: Any, folder: Path, *, has_videos: bool = False) -> Any:
@@ -478,6 +495,14 @@ def _in_folder(value: Any, folder: Path, *, has_videos: bool = False) -> Any:
         return {token: _in_folder(item, folder, has_videos=has_videos) for token, item in value.items()}
     names_video = has_videos and isinstance(value, str) and is_video_name(Path(value))
     return folder / Path(value).expanduser() if names_video or is_file(value) else value
+
+
+def _series_in_folder(inputs: Any, folder: Path) -> Any:
+    """Return the inputs of a case of a graph with state, with the paths of files, of a folder or of a glob."""
+    if isinstance(inputs, list):
+        return [_in_folder(item, folder, has_videos=True) for item in inputs]
+    is_path = isinstance(inputs, str) and (not is_one_image(inputs) or (folder / inputs).is_dir())
+    return folder / inputs if is_path else _in_folder(inputs, folder, has_videos=True)
 
 
 def _hyperparameter(token: str, entry: Any) -> Any:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, with_labels_read
 from epypes.batch.executors import run_jobs
-from epypes.batch.items import detached_runner, items_of, read_value
+from epypes.batch.items import case_items, detached_runner, read_value
 from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
 from epypes.batch.progress import progress_bar
@@ -101,7 +101,8 @@ def check(
     runner
         Its graph and hyperparameters are used; it is left as it is.
     cases
-        ``ep.Case``s, dicts with the parts of one, or the path of a CASES.toml.
+        ``ep.Case``s, dicts with the parts of one, or the path of a CASES.toml. Of a graph with state the inputs of a
+        case are a sequence: what it gives at its end is measured.
     executor
         None runs the cases in this thread; any ``concurrent.futures.Executor`` elsewhere. Metrics are computed here.
     progress
@@ -149,7 +150,8 @@ def prepare_cases(runner: CompGraphRunner, cases: Any) -> Checks:
     ScaleError, UnknownName
         As ``check`` does.
     """
-    return [(_with_members(case, runner), checks_of(case, runner.cg)) for case in cases_of(cases)]
+    found = cases_of(cases, are_series=bool(runner.state))
+    return [(_with_members(case, runner), checks_of(case, runner.cg)) for case in found]
 
 
 def _with_members(case: Case, runner: CompGraphRunner) -> Case:
@@ -192,7 +194,7 @@ def run_checks(
     """
 
     def jobs() -> Iterator[Job]:
-        items = items_of([case.inputs for case, _ in cases], runner)
+        items = case_items([case.inputs for case, _ in cases], runner)
         for item, (case, checks) in zip(items, cases, strict=True):
             show = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
             keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))

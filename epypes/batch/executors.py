@@ -51,7 +51,7 @@ _GRACE_S: Final = 2.0
 
 def run_jobs(
     runner: CompGraphRunner,
-    jobs: Iterable[Job],
+    jobs: Iterable[Job | None],
     executor: Executor | None = None,
     *,
     ahead: int | None = None,
@@ -64,7 +64,7 @@ def run_jobs(
     runner
         Its graph and hyperparameters are used, on runners of its own; it is left as it is.
     jobs
-        Taken one by one, when there is room for another.
+        Taken one by one, when there is room for another. None: there is none before one that runs has ended.
     executor
         None: this thread runs them. A ThreadPoolExecutor runs the graph itself; any other executor a bundle of it.
         Functions that keep something from one item to the next give other results on threads, which share it and take
@@ -98,10 +98,10 @@ def runs_here(executor: Executor | None) -> bool:
     return executor is None or isinstance(executor, ThreadPoolExecutor)
 
 
-def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event) -> Iterator[list[Outcome]]:
+def _run_here(runner: CompGraphRunner, jobs: Iterable[Job | None], stop: threading.Event) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
     for job in () if stop.is_set() else jobs:
-        for outcome in run_job(own, job):
+        for outcome in run_job(own, job, stop.is_set) if job is not None else ():
             yield [outcome]
             if stop.is_set():
                 return
@@ -123,7 +123,7 @@ class _WorkersKilled(Exception):
 
 
 def _run_in_flight(
-    backend: _Threads | _Processes, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event
+    backend: _Threads | _Processes, jobs: Iterable[Job | None], most: int, over: threading.Event, stop: threading.Event
 ) -> Iterator[list[Outcome]]:
     """Keep so many jobs in flight; yield what comes; leave none behind, however it ends."""
     in_flight: dict[Future[Any], Job] = {}
@@ -255,10 +255,13 @@ class _Threads:
 
     def _run(self, job: Job) -> list[Outcome]:
         outcomes: list[Outcome] = []
-        waiting = run_job(branched(self._runner), job)
-        while not any(stop.is_set() for stop in self._stops) and (outcome := next(waiting, None)) is not None:
+        waiting = run_job(branched(self._runner), job, self._is_over)
+        while not self._is_over() and (outcome := next(waiting, None)) is not None:
             outcomes.append(outcome)
         return outcomes
+
+    def _is_over(self) -> bool:
+        return any(stop.is_set() for stop in self._stops)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""
@@ -290,7 +293,7 @@ class _Processes:
         if package is None:
             return _done(list(run_job(clone_runner(self._runner), job)))
         try:
-            job = read_frames(job, self._runner.cg)
+            job = read_frames(job, self._runner.cg, of_cases=True)
         except ImageFileError:
             return _done(list(run_job(clone_runner(self._runner), job)))
         # A worker process that has not unpacked the package yet asks for its files.

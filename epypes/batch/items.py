@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
@@ -42,20 +42,24 @@ class Item:
         Values by free source token; a Path stands for an image file, a VideoFrame for a frame of a video, which are
         read when the item is run.
     series
-        The video, as its path, or the camera that it is a frame of: the items of one series come in the order of their
-        times. "" for an item that stands alone.
+        The key of its series. Without one that the caller gives it is the video, as its path, or the camera that it is
+        a frame of, and "" for an item that stands alone: the items of one series come in the order of their times.
     frame
         The number of the frame, from 0; None for what is none.
     time_s
         The time of the frame in s since the first one; None for what has no time.
+    frames
+        Of a case of a graph with state: the items that are run one after another in its place, or the path of a folder,
+        of a glob or of a video of them; None of any other item.
     """
 
     number: int
     name: str
     payload: Mapping[str, Any]
-    series: str = ""
+    series: Hashable = ""
     frame: int | None = None
     time_s: float | None = None
+    frames: tuple[Item, ...] | str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +156,122 @@ def count_of(images: Any) -> int | None:
 def _count(value: Any) -> int:
     video = _video_in(value) if isinstance(value, Mapping | Video) else None
     return 1 if video is None else len(video[1])
+
+
+# -- series -----------------------------------------------------------------------------------------------------
+
+SeriesKeys = Callable[[Any], Hashable] | Iterable[Hashable]
+
+
+def with_series(items: Iterator[Item], series: SeriesKeys | None) -> Iterator[Item]:
+    """Yield items with the keys of their series.
+
+    Parameters
+    ----------
+    items
+        The inputs.
+    series
+        A function that is called with the value of an item, of several free source tokens with a dict of values; of a
+        file it is given the Path, of a frame of a video the VideoFrame. Or a key per item. None: items keep theirs.
+
+    Raises
+    ------
+    ScaleError
+        There is no key for an item, or none that can be told from others.
+    """
+    if series is None:
+        return items
+    if isinstance(series, str | Mapping) or not (callable(series) or isinstance(series, Iterable)):
+        raise ScaleError(
+            f"series={series!r:.60} says no series. Give a key per item, or a function of an item that returns one: "
+            "series=lambda path: path.parent.name."
+        )
+    return _keyed(items, series) if callable(series) else _zipped(items, series)
+
+
+def _keyed(items: Iterator[Item], key_of: Callable[[Any], Hashable]) -> Iterator[Item]:
+    for item in items:
+        key = key_of(next(iter(item.payload.values())) if len(item.payload) == 1 else dict(item.payload))
+        yield _in_series(item, key)
+        # This generator waits for its caller, and must not keep the item alive meanwhile.
+        del item
+
+
+def _zipped(items: Iterator[Item], series: Iterable[Hashable]) -> Iterator[Item]:
+    keys, number = iter(series), -1
+    for number, item in enumerate(items):
+        try:
+            key = next(keys)
+        except StopIteration:
+            raise ScaleError(f"series has {number} keys, and there are more items. Give a key per item.") from None
+        yield _in_series(item, key)
+        del item
+    if next(keys, ABSENT_KEY) is not ABSENT_KEY:
+        raise ScaleError(f"series has more keys than there are items: {number + 1}. Give a key per item.")
+
+
+# Stands for a key that is not there, since None is one.
+ABSENT_KEY: Final = object()
+
+
+def _in_series(item: Item, key: Hashable) -> Item:
+    try:
+        hash(key)
+        is_key = bool(key == key)
+    except (TypeError, ValueError):
+        is_key = False
+    if not is_key:
+        raise ScaleError(f"The series of {item.name} is {key!r:.60}, which is no key. Give numbers or texts.")
+    return replace(item, series=key)
+
+
+def is_one_image(inputs: Any) -> bool:
+    """Whether the inputs of a case of a graph with state are one payload, and no sequence of them."""
+    if isinstance(inputs, str | os.PathLike):
+        path = Path(inputs).expanduser()
+        is_several = path.is_dir() or any(mark in str(inputs) for mark in _SHOWN)
+        return not is_video_name(path) and (path.is_file() or not is_several)
+    shape = getattr(inputs, "shape", None)
+    if isinstance(shape, tuple):
+        return len(shape) < 3 or (len(shape) == 3 and shape[2] in (3, 4))
+    if isinstance(inputs, Mapping):
+        return not any(isinstance(value, Video) or _is_video_file(value) for value in inputs.values())
+    return not isinstance(inputs, Iterable)
+
+
+def case_items(inputs: Iterable[Any], runner: CompGraphRunner) -> Iterator[Item]:
+    """Yield an item for the inputs of each case: of a graph with state, a series of its own.
+
+    Raises
+    ------
+    ScaleError
+        An item does not give the free source tokens.
+    """
+    if not runner.state:
+        yield from items_of(inputs, runner)
+        return
+    for number, given in enumerate(inputs):
+        if isinstance(given, str | os.PathLike) and not is_one_image(given):
+            path = os.path.abspath(Path(given).expanduser())
+            _only(runner.free_source_tokens, f"{str(given)!r} gives one image at a time")
+            yield Item(number, str(given), {}, frames=path)
+        else:
+            is_payload = is_one_image(given) or isinstance(given, Mapping)
+            frames = tuple(items_of([given] if is_payload else given, runner))
+            yield Item(number, frames[0].name if len(frames) == 1 else f"#{number}", {}, frames=frames)
+
+
+def frames_of(item: Item, runner: CompGraphRunner) -> Iterator[Item]:
+    """Return what is run of an item, one after another: its frames, or the item itself.
+
+    Raises
+    ------
+    ScaleError
+        There is no such folder, or nothing in it.
+    """
+    if item.frames is None:
+        return iter([item])
+    return iter(item.frames) if isinstance(item.frames, tuple) else items_of(item.frames, runner)
 
 
 # -- files ------------------------------------------------------------------------------------------------------

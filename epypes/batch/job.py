@@ -9,15 +9,16 @@ from time import perf_counter_ns
 from typing import Any, Final
 
 from epypes.acquisition.video import VideoFrame
-from epypes.batch.items import Item, payload_of, read_value
+from epypes.batch.items import Item, frames_of, payload_of, read_value
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, ScaleError
 from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner
+from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
 
 Setting = Mapping[str, Any]
+State = Mapping[str, Any]
 # One object, since settings are compared by identity.
 NO_SETTING: Final[Setting] = {}
 
@@ -40,6 +41,8 @@ class Job:
         The first run of the item, which several jobs share in this process; None for one of its own.
     targets
         Tokens; only what they need is run, branches that are not chosen too. Everything without.
+    states
+        Of a graph with state, what the item begins with, by setting; frames begin with the initial state without.
     """
 
     item: Item
@@ -48,9 +51,10 @@ class Job:
     show: tuple[str, ...] | None = ()
     start: SharedStart | None = None
     targets: tuple[str, ...] = ()
+    states: tuple[State, ...] = ()
 
 
-def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
+def run_job(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool] = lambda: False) -> Iterator[Outcome]:
     """Yield the outcomes of a job, setting by setting.
 
     Parameters
@@ -58,8 +62,49 @@ def run_job(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     runner
         One that no other thread uses; it has its hyperparameters again afterwards.
     job
-        The item and its settings. Of the second setting on only what depends on what changed is run.
+        The item and its settings. Of the second setting on only what depends on what changed is run, unless the graph
+        has state between runs.
+    is_over
+        Is asked before each frame of a case whether it is to end there, without an outcome.
     """
+    has_state = job.states or job.item.frames is not None
+    return _run_with_state(runner, job, is_over) if has_state else _run_without_state(runner, job)
+
+
+def _run_with_state(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool]) -> Iterator[Outcome]:
+    """Run the item, or its frames one after another, from the beginning for each setting; give the last outcomes."""
+    for place, setting in enumerate(job.settings):
+        outcome = _outcome_with_state(runner, job, setting, job.states[place] if job.states else {}, is_over)
+        if outcome is None:
+            return
+        yield outcome
+
+
+def _outcome_with_state(
+    runner: CompGraphRunner, job: Job, setting: Setting, state: State, is_over: Callable[[], bool]
+) -> Outcome | None:
+    item, total_ns, last = job.item, 0, None
+    try:
+        for place, frame in enumerate(frames_of(item, runner)):
+            if is_over():
+                return None
+            last = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
+            total_ns += last.report.total_ns
+            state = last.state
+            if last.failure is not None:
+                if not isinstance(last.failure.exception, Exception | SystemExit):  # Ctrl+C ends the map
+                    raise last.failure.exception
+                where = "" if item.frames is None else f" (frame {place}: {frame.name})"
+                return _outcome_of(last, job, setting, Album(), total_ns, state, where)
+        if last is None:
+            raise ScaleError(f"{item.name} has no frames. Give one at least.")
+    except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
+        (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
+        return replace(failed, state=state)
+    return _outcome_of(last, job, setting, Album(), total_ns, state)
+
+
+def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
     item, start, now = job.item, job.start or SharedStart(), runner.hyperparameters
     # A setting may leave out what another one has: that is then as it was.
     varied = {token: now[token] for setting in job.settings for token in setting if token in now}
@@ -97,30 +142,50 @@ def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorIn
     return [_blank(item, setting, error_info) for setting in settings]
 
 
-def read_frames(job: Job, cg: CompGraph) -> Job:
+def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:
     """Return a job with the pixels of its frames of a video, for an executor: this thread decodes them, in order.
 
     So a video is decoded once, without seeking, and worker processes need neither the file nor its codec.
+
+    Parameters
+    ----------
+    job, cg
+        The job, and the graph, which has the order of colours.
+    of_cases
+        Whether the frames that are run in the place of the item are read, too: they are then in memory together.
 
     Raises
     ------
     ImageFileError
         A frame is damaged.
     """
-    payload = job.item.payload
-    if not any(isinstance(value, VideoFrame) for value in payload.values()):
-        return job
+    item = _with_pixels(job.item, cg)
+    if of_cases and isinstance(item.frames, tuple):
+        item = replace(item, frames=tuple(_with_pixels(frame, cg) for frame in item.frames))
+    return job if item is job.item else replace(job, item=item)
+
+
+def _with_pixels(item: Item, cg: CompGraph) -> Item:
+    if not any(isinstance(value, VideoFrame) for value in item.payload.values()):
+        return item
     read = {
         token: read_value(value, cg, token) if isinstance(value, VideoFrame) else value
-        for token, value in payload.items()
+        for token, value in item.payload.items()
     }
-    return replace(job, item=replace(job.item, payload=read))
+    return replace(item, payload=read)
 
 
 def _blank(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
     """Return the outcome of an item that has no values."""
     return Outcome(
-        item.number, item.name, setting, total_ns=total_ns, error_info=error_info, frame=item.frame, time_s=item.time_s
+        item.number,
+        item.name,
+        setting,
+        total_ns=total_ns,
+        error_info=error_info,
+        frame=item.frame,
+        time_s=item.time_s,
+        series=item.series,
     )
 
 
@@ -147,7 +212,24 @@ def _outcome(
             info = ErrorInfo("", type(error).__name__, str(error))
             return _blank(item, setting, info, perf_counter_ns() - start_ns)
         run = runner.last
-    report, tokens, failure = run.report, run.tokens, run.failure
+    return _outcome_of(run, job, setting, album)
+
+
+def _outcome_of(
+    run: Run, job: Job, setting: Setting, album: Album, total_ns: int = 0, state: State = NO_SETTING, where: str = ""
+) -> Outcome:
+    """Return the outcome of a run.
+
+    Parameters
+    ----------
+    total_ns
+        Of the runs before it too; 0: its own.
+    state
+        What it has left.
+    where
+        Is added to the message of a failure.
+    """
+    item, report, tokens, failure = job.item, run.report, run.tokens, run.failure
     sinks = [token for token in run.cg.sink_tokens if tokens.is_readable(token)]
     thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
@@ -156,14 +238,16 @@ def _outcome(
         setting,
         {token: short_value(run[token]) for token in sinks if not tokens.is_nothing(token)},
         report.durations_ns,
-        report.total_ns,
-        None if failure is None else ErrorInfo(failure.function, failure.kind, failure.message),
+        total_ns or report.total_ns,
+        None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
-        tuple(filter(tokens.is_nothing, sinks)),
-        item.frame,
-        item.time_s,
+        nothing=tuple(filter(tokens.is_nothing, sinks)),
+        series=item.series,
+        state=state,
+        frame=item.frame,
+        time_s=item.time_s,
     )
 
 

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cache import outcome_cache
+from epypes.acquisition.video import Video
+from epypes.batch.cache import OutcomeCache, outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
-from epypes.batch.items import Item, count_of, detached_runner, image_set, items_of
-from epypes.batch.job import NO_SETTING, Job, SharedStart
+from epypes.batch.items import (
+    FileSet,
+    Item,
+    SeriesKeys,
+    count_of,
+    detached_runner,
+    holds_its_arrays,
+    image_set,
+    items_of,
+    with_series,
+)
+from epypes.batch.job import NO_SETTING, Job, SharedStart, State
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, OutcomeSequence, fixed_columns, outcomes_frame, outcomes_html
+from epypes.batch.series import Done, SeriesRuns, in_parts, whole_series
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -29,6 +42,7 @@ if TYPE_CHECKING:
 # Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
 _PARTS: Final = 16
 _MOST_SETTINGS: Final = 256
+_JOBS_PER_WORKER: Final = 2
 # Each of at most 5 KB, and some belong to several outcomes.
 _MOST_PICTURES: Final = 200_000
 _UNITS: Final = {"map": "image", "sweep": "setting"}
@@ -138,6 +152,7 @@ def map_images(
     *,
     keep: Sequence[str] = (),
     show: Sequence[str] | None = (),
+    series: SeriesKeys | None = None,
     store: str | Path | Store | None = None,
     name: str | None = None,
     progress: bool | None = None,
@@ -158,14 +173,24 @@ def map_images(
         None: this thread runs the images. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the
         same, unless a function keeps something from one item to the next: a bundle refuses it, threads can't notice it.
+        ``ep.delay`` keeps it in a token.
         Functions of a module that is not installed, such as a file next to the notebook, can't go to other processes.
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.
     show
         Tokens of which thumbnails are kept, which the table shows; None: all that have a picture.
+    series
+        How the images are divided into series: a key per image, or a function that is called with an image and returns
+        its key (of a file with its Path, of several free source tokens with a dict):
+        ``series=lambda path: path.parent.name``. Without, each video is a series, and so are all other images together.
+        The table gets a column of the keys. A graph with state (``ep.delay``) runs a series in order, wherever there is
+        a worker: it begins with the initial state, and each image with the state that the one before has left; one that
+        fails leaves it as it was. Several series are run side by side.
     store
         A path, a URL or an ep.Store, where outcomes are written as they come. What is there already is not run again,
-        unless ``keep`` is given: so a map that was interrupted goes on.
+        unless ``keep`` is given: so a map that was interrupted goes on. Of a graph with state an outcome counts for its
+        image and all images before it in its series; series of which some is missing are run from their beginning, and
+        so are those of a generator.
     name
         What the series in the store is called; without, a digest of the graph, its hyperparameters and all that its
         functions use: code, globals, attributes, modules. Under a name that is taken, other code or other
@@ -208,7 +233,7 @@ def map_images(
     """
     outcomes = run_items(
         runner, images, (NO_SETTING,), executor,
-        kind="map", keep=keep, show=show, store=store, name=name, progress=progress, ahead=ahead,
+        kind="map", keep=keep, show=show, series=series, store=store, name=name, progress=progress, ahead=ahead,
     )  # fmt: skip
     return MapResult(runner.cg, outcomes)
 
@@ -224,6 +249,7 @@ def sweep(
     seed: int = 0,
     keep: Sequence[str] = (),
     show: Sequence[str] | None = None,
+    series: SeriesKeys | None = None,
     store: str | Path | Store | None = None,
     name: str | None = None,
     progress: bool | None = None,
@@ -238,7 +264,7 @@ def sweep(
         Values by hyperparameter: lists, arrays, or an ``ep.Param`` whose values can be counted; None for those that
         its hint allows. Or a list of settings, each a dict, taken as they are.
     images
-        As for ``map``; None: the runner's last payload.
+        As for ``map``; None: the runner's last payload, and the state that the last run began with.
     executor
         Any of ``concurrent.futures``, as for ``map``. Threads share what the settings have in common; processes that
         run parts of the grid on one image compute it each.
@@ -254,6 +280,8 @@ def sweep(
         Tokens whose values are kept in ``outcome.kept``; of all others only thumbnails, numbers and texts are.
     show
         Tokens of which thumbnails are made; None: all that have a picture. Of others a text is kept.
+    series
+        As for ``map``: of a graph with state each series is run whole with each setting, from its beginning.
     store, name
         As for ``map``: settings that are stored already are not run again.
     progress
@@ -283,12 +311,14 @@ def sweep(
     >>> [outcome.values["total"] for outcome in result]
     [11, 21, 12, 22]
     """
+    state: State | None = None
     if images is None:
         images = [Item(0, "last payload", _last_payload(runner))]
+        state = None if runner.last is None else runner.last.state_before or None
     settings = settings_of(runner, grid, how=how, n=n, seed=seed)
     outcomes = run_items(
         runner, images, settings, executor,
-        kind="sweep", keep=keep, show=show, store=store, name=name, progress=progress,
+        kind="sweep", keep=keep, show=show, series=series, state=state, store=store, name=name, progress=progress,
     )  # fmt: skip
     return SweepResult(outcomes, tuple(settings[0]), runner)
 
@@ -320,6 +350,68 @@ def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
 # -- items and settings as jobs -------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """What is run on which images; ``settings`` are in the order in which they are run."""
+
+    runner: CompGraphRunner
+    images: Any
+    series: SeriesKeys | None
+    settings: tuple[Setting, ...]
+    executor: Executor | None
+    kept: tuple[str, ...]
+    shown: tuple[str, ...] | None
+    is_sweep: bool
+
+    def items(self) -> Iterator[Item]:
+        for item in with_series(items_of(self.images, self.runner), self.series):
+            # How many a generator gives is known when it gives them; a map may be of any number.
+            if self.is_sweep:
+                _require_room(self.runner, self.settings, self.shown, item.number + 1)
+            yield item
+            # This generator waits for its caller, and must not keep the item alive meanwhile.
+            del item
+
+    def jobs(self, cache: OutcomeCache | None, take: Callable[[list[Outcome]], None]) -> Iterator[Job]:
+        """Yield the jobs of each item: what is not stored, in parts, which in this process share the first run."""
+        count = count_of(self.images)
+        for item in self.items():
+            missing = self.settings
+            if cache is not None:
+                stored = cache.found(item)
+                take([outcome for outcome in stored if outcome is not None])
+                missing = tuple(one for one, outcome in zip(missing, stored, strict=True) if outcome is None)
+            parts = _parts(self.runner, missing, self.executor, count)
+            start = SharedStart() if len(parts) > 1 and runs_here(self.executor) else None
+            for part in parts:
+                yield Job(item, part, self.kept, self.shown, start)
+            del item, start
+
+    def series_runs(
+        self, state: State, cache: OutcomeCache | None, take: Callable[[list[Outcome]], None]
+    ) -> SeriesRuns:
+        """Return the runs of series; those of which all is stored are taken from there."""
+        items, done = self.items(), set[Done]()
+        if cache is not None and cache.has_outcomes:
+            stored, done = whole_series(self.items(), self.settings, cache.found)
+            take(stored)
+        elif cache is not None:
+            items = cache.noting(items)
+        if self.executor is None:
+            return SeriesRuns(items, [self.settings], state, 1, done)
+        room: float = _JOBS_PER_WORKER * worker_count(self.executor)
+        parts = in_parts(self.settings, int(room))
+        # Of what is in memory anyway, or in files, so many are taken that all series begin.
+        is_held = isinstance(self.images, FileSet | Video) or holds_its_arrays(self.images)
+        room = math.inf if is_held else room
+        return SeriesRuns(items, parts, state, room, done)
+
+    def series_jobs(self, runs: SeriesRuns) -> Iterator[Job | None]:
+        for one in runs:
+            yield None if one is None else Job(one[0], one[1], self.kept, self.shown, states=one[2])
+            del one
+
+
 def run_items(
     runner: CompGraphRunner,
     images: Any,
@@ -329,28 +421,37 @@ def run_items(
     kind: str,
     keep: Sequence[str],
     show: Sequence[str] | None,
+    series: SeriesKeys | None,
     store: str | Path | Store | None,
     name: str | None,
     progress: bool | None,
+    state: State | None = None,
     ahead: int | None = None,
 ) -> tuple[Outcome, ...]:
     """Return the outcomes of items under settings: item by item, in each in the order of its settings.
 
-    The parameters are those of ``map`` and ``sweep``; ``kind`` is ``"map"`` or ``"sweep"``.
+    The parameters are those of ``map`` and ``sweep``; ``kind`` is ``"map"`` or ``"sweep"``. Each series begins with
+    ``state``, without it with the initial state of the graph.
     """
     # If the caller changes hyperparameters meanwhile, that does not change what is computed and stored.
     runner = detached_runner(runner)
+    state = runner.state or None if state is None else state
     kept, shown = tokens_of(runner, keep), None if show is None else tokens_of(runner, show)
     in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
     images = image_set(images)
-    count = count_of(images)
-    if kind == "sweep":
+    count, is_sweep = count_of(images), kind == "sweep"
+    if is_sweep:
         _require_room(runner, settings, shown, count or 1)
+    batch = _Batch(runner, images, series, in_order, executor, kept, shown, is_sweep)
+    # Where what is stored decides which series are run, the items are gone through twice.
+    is_read = state is None or not (isinstance(images, Iterator) or isinstance(series, Iterator))
     outcomes: list[Outcome] = []
     with (
-        outcome_cache(store, kind, runner, name, keep=kept, show=shown, settings=in_order) as cache,
+        outcome_cache(
+            store, kind, runner, name, keep=kept, show=shown, settings=in_order, state=state, is_read=is_read
+        ) as cache,
         progress_bar(progress, count and count * len(settings), kind, unit=_UNITS[kind]) as advance,
     ):
 
@@ -358,28 +459,13 @@ def run_items(
             outcomes.extend(found)
             advance(len(found), sum(outcome.has_failed for outcome in found))
 
-        def jobs() -> Iterator[Job]:
-            """Yield the jobs of each item: what is not stored, in parts, which in this process share the first run."""
-            for item in items_of(images, runner):
-                # How many a generator gives is known when it gives them; a map may be of any number.
-                if kind == "sweep":
-                    _require_room(runner, settings, shown, item.number + 1)
-                missing = in_order
-                if cache is not None:
-                    stored = cache.found(item)
-                    take([outcome for outcome in stored if outcome is not None])
-                    missing = tuple(one for one, outcome in zip(in_order, stored, strict=True) if outcome is None)
-                parts = _parts(runner, missing, executor, count)
-                start = SharedStart() if len(parts) > 1 and runs_here(executor) else None
-                for part in parts:
-                    yield Job(item, part, kept, shown, start)
-                # This generator waits for its caller, and must not keep the item alive meanwhile.
-                del item, start
-
-        for found in run_jobs(runner, jobs(), executor, ahead=ahead):
+        runs = None if state is None else batch.series_runs(state, cache, take)
+        source = batch.jobs(cache, take) if runs is None else batch.series_jobs(runs)
+        for found in run_jobs(runner, source, executor, ahead=ahead):
+            settled = found if runs is None else runs.settle(found)
             if cache is not None:
-                cache.add(found)
-            take(found)
+                cache.add(settled)
+            take(settled)
     return tuple(sorted(outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
 
 

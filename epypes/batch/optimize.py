@@ -24,7 +24,7 @@ from epypes.batch.cache import SearchKey
 from epypes.batch.cases import Case, cases_of, with_labels_read
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, ChoiceAxis, axes_of, bounded
-from epypes.batch.items import detached_runner, items_of
+from epypes.batch.items import case_items, detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
@@ -32,6 +32,7 @@ from epypes.batch.results import Outcome, frame_of, html_table, object_column, v
 from epypes.batch.thumbnails import data_uri, thumbnail_of_value
 from epypes.display.text import content, cut, cut_name, escape
 from epypes.errors import ScaleError
+from epypes.graph import subgraph
 from epypes.nothing import Nothing
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
@@ -264,7 +265,8 @@ def optimize(
         counts is the mean over all cases.
     cases
         ``ep.Case``, dicts or inputs alone; the path of a file of cases; or a folder or glob of images. Without labels a
-        case is its inputs.
+        case is its inputs. Of a graph with state these are a sequence, and a folder is one case: the metric is given
+        what the last image leaves.
     n
         How many trials there are to be: with a store, those that are in there already count.
     executor
@@ -358,8 +360,10 @@ def _key(objective: _Objective, axes: Sequence[Axis], direction: str, name: str 
 def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
     """Return the cases with their labels read."""
     if isinstance(given, str | Path) and Path(given).suffix != _CASE_FILE and not is_video_name(Path(given)):
+        if runner.state:
+            return (Case(given, name=str(given)),)
         return tuple(Case(item.payload, name=item.name) for item in items_of(given, runner))
-    return tuple(with_labels_read(case, runner.cg) for case in cases_of(given))
+    return tuple(with_labels_read(case, runner.cg) for case in cases_of(given, are_series=bool(runner.state)))
 
 
 def _searched(
@@ -393,7 +397,8 @@ def _trials(
     asked: dict[int, optuna.trial.Trial] = {}
     found: dict[int, dict[int, Outcome]] = {}
     # In this process each case goes on from its last run, as far as memory is for that.
-    starts = [SharedStart() if runs_here(executor) else None for _ in objective.items]
+    is_shared = runs_here(executor) and not objective.runner.state
+    starts = [SharedStart() if is_shared else None for _ in objective.items]
     held_bytes: dict[int, int] = {}
 
     def jobs() -> Iterator[Job]:
@@ -406,7 +411,7 @@ def _trials(
                     break
                 marked = replace(item, number=number * len(objective.items) + index)
                 own = {**setting, **(case.hyperparameters or {})}
-                yield Job(marked, (own,), keep=objective.keep, start=starts[index], targets=objective.keep)
+                yield Job(marked, (own,), keep=objective.keep, start=starts[index], targets=objective.targets)
 
     ahead = None if executor is None else worker_count(executor)
     has_ended = False
@@ -458,12 +463,15 @@ class _Objective:
             kind = type(metric).__name__
             raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
         self.runner, self.cases = runner, tuple(cases)
-        items = items_of([case.inputs for case in cases], runner)
+        items = case_items([case.inputs for case in cases], runner)
         self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
         self.metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         kept = runner.cg.sink_tokens if keep is None else keep
         self.keep = tokens_of(runner, metric if isinstance(metric, str) else kept)
+        # What the next frame of a case begins with is needed too.
+        delayed = (delay.token for delay in subgraph(runner.cg, self.keep).delays.values())
+        self.targets = tuple(dict.fromkeys((*self.keep, *delayed)))
 
     def score(self, outcomes: Mapping[int, Outcome]) -> tuple[float | None, str, int]:
         """Return the mean of the metric over the cases, or None and the first failure; and the time of the functions.

@@ -19,7 +19,7 @@ from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
 from epypes.batch.cache import graph_fingerprint
-from epypes.batch.items import Item, payload_of
+from epypes.batch.items import Item, frames_of, payload_of
 from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
@@ -81,7 +81,7 @@ def package_of(runner: CompGraphRunner, item: Item) -> PackagedGraph | None:
         return _PACKAGES[key]
     own = clone_runner(runner)
     try:
-        own.run_on(payload_of(item, own.cg))
+        own.run_on(payload_of(next(frames_of(item, own)), own.cg))
     except (Exception, SystemExit):  # whatever a function raises: it will be that item's failure
         return None
     with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
@@ -161,6 +161,8 @@ def packed(value: Any, what: str) -> Any:
     ScaleError
         There is no codec for values of its type.
     """
+    if isinstance(value, WireValue | TomlValue):  # a state that goes on as it came
+        return value
     if type(value) in _AS_THEY_ARE or (is_plain_array(value) and not value.dtype.hasobject):
         return value
     try:
@@ -200,8 +202,20 @@ def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:
 
 
 def _with_values(job: Job, convert: Callable[[Mapping[str, Any], str], dict[str, Any]]) -> Job:
-    item = replace(job.item, payload=convert(job.item.payload, "Input"))
-    return replace(job, item=item, settings=tuple(convert(setting, "Hyperparameter") for setting in job.settings))
+    return replace(
+        job,
+        item=_item_with_values(job.item, convert),
+        settings=tuple(convert(setting, "Hyperparameter") for setting in job.settings),
+        states=tuple(convert(state, "The state of") for state in job.states),
+    )
+
+
+def _item_with_values(item: Item, convert: Callable[[Mapping[str, Any], str], dict[str, Any]]) -> Item:
+    frames = item.frames
+    if isinstance(frames, tuple):
+        frames = tuple(_item_with_values(frame, convert) for frame in frames)
+    # The key of a series may be anything, and only this process needs it.
+    return replace(item, payload=convert(item.payload, "Input"), series=None, frames=frames)
 
 
 def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
@@ -212,7 +226,7 @@ def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
         for value in kept.values():
             if is_plain_array(value):
                 value.flags.writeable = False
-        unpacked.append(replace(outcome, setting=setting, kept=kept))
+        unpacked.append(replace(outcome, setting=setting, kept=kept, series=job.item.series))
     return unpacked
 
 
@@ -284,7 +298,12 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
     try:
         # Without its setting, which the process that sent the job has.
         return [
-            replace(outcome, setting={}, kept=packed_values(outcome.kept, "Token"))
+            replace(
+                outcome,
+                setting={},
+                kept=packed_values(outcome.kept, "Token"),
+                state=packed_values(outcome.state, "The state of"),
+            )
             for outcome in run_job(own, unpacked_job(packaged.job, enums))
         ]
     except ScaleError as error:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 # What reading a file raises.
 _UNREADABLE: Final = frozenset({ImageFileError.__name__, ScaleError.__name__})
+_NOT_STORED: Final = frozenset({"kept", "series", "state"})
 # Python can be configured to refuse numbers of more than 640 digits.
 _MOST_BITS: Final = 2_126
 
@@ -86,8 +87,12 @@ class Outcome:
         Of tokens whose thumbnails were asked for and that have no picture: a text instead.
     nothing
         The sink tokens whose value is Nothing; their cells of a table are empty.
+    series
+        The key of the item's series.
     frame, time_s
         Of a frame of a video or a camera, its number, from 0, and its time in s since the first one; else None.
+    state
+        Of a graph with state, what the next item of the series begins with; a map does not keep it.
     """
 
     number: int
@@ -103,6 +108,8 @@ class Outcome:
     nothing: tuple[str, ...] = ()
     frame: int | None = None
     time_s: float | None = None
+    series: Any = ""
+    state: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def has_failed(self) -> bool:
@@ -110,12 +117,12 @@ class Outcome:
         return self.error_info is not None
 
     def to_json(self) -> dict[str, Any]:
-        """Return all but ``kept`` as JSON can hold it."""
+        """Return all but ``kept`` and the series as JSON can hold it."""
         setting = {token: short_value(value) for token, value in self.setting.items()}
-        data = asdict(replace(self, setting=setting, times_ns=dict(self.times_ns), kept={}))
+        data = asdict(replace(self, setting=setting, times_ns=dict(self.times_ns), kept={}, series=None, state={}))
         for shown in data["thumbnails"].values():
             shown["data"] = base64.b64encode(shown["data"]).decode()
-        return {name: part for name, part in data.items() if name != "kept"}
+        return {name: part for name, part in data.items() if name not in _NOT_STORED}
 
     @staticmethod
     def from_json(data: Mapping[str, Any], item: Item, setting: Mapping[str, Any]) -> Outcome:
@@ -128,7 +135,7 @@ class Outcome:
         error_info = None if info is None else ErrorInfo(**info)
         found = replace(Outcome(**data), number=item.number, name=item.name, setting=setting)
         found = replace(found, error_info=error_info, thumbnails=thumbnails, nothing=tuple(found.nothing))
-        return replace(found, frame=item.frame, time_s=item.time_s)
+        return replace(found, frame=item.frame, time_s=item.time_s, series=item.series)
 
 
 class OutcomeSequence(Sequence[Outcome]):
@@ -181,13 +188,17 @@ _FRAME_COLUMNS: Final = ("frame", "time_s")
 
 def fixed_columns(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
     """Return the names of the columns that a table of outcomes has in any case."""
-    return ("name", *_frame_columns(outcomes), "failure", "total_ms")
+    return ("name", *_item_columns(outcomes), "failure", "total_ms")
 
 
-def _frame_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
-    """Return the columns of frames, where any outcome is one, and of times, where any has one."""
+def _item_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
+    """Return the columns that there are: of series if there are several or they have keys, of frames, and of times."""
     columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in _FRAME_COLUMNS}
-    return {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    found = {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    series = [outcome.series for outcome in outcomes]
+    # Of the frames of one video the names say it.
+    has_series = len(set(series)) > 1 or ("frame" not in found and any(key != "" for key in series))
+    return {"series": series, **found} if has_series else found
 
 
 def outcomes_frame(
@@ -207,14 +218,14 @@ def outcomes_frame(
     Returns
     -------
     pandas.DataFrame
-        ``name``, of frames ``frame`` and ``time_s``, the extra columns, ``failure`` (None, or what failed), one column
-        per sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token that is called like another column
-        has `` (token)`` after its name.
+        ``name``, ``series`` if there are some, of frames ``frame`` and ``time_s``, the extra columns, ``failure``
+        (None, or what failed), one column per sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token
+        that is called like another column has `` (token)`` after its name.
         Where nothing was found, or the run failed, the cell of the token is empty: None, NaN or NA.
     """
     fixed = fixed_columns(outcomes)
     columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= {column: _column(values) for column, values in _frame_columns(outcomes).items()}
+    columns |= {column: _column(values) for column, values in _item_columns(outcomes).items()}
     columns |= {column: object_column(values) for column, values in extra.items()}
     columns["failure"] = object_column(
         [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
@@ -324,10 +335,11 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in outcomes)]
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
-    has_times = "time_s" in _frame_columns(outcomes)
+    has_series, has_times = ("series" in _item_columns(outcomes), "time_s" in _item_columns(outcomes))
     rows = [
         [
             outcome.name,
+            *([value_text(outcome.series)] if has_series else []),
             *([] if not has_times else ["" if outcome.time_s is None else f"{outcome.time_s:.3f} s"]),
             *(outcome.thumbnails.get(token) for token in shown),
             *(_cell_text(outcome, token) for token in sinks),
@@ -336,7 +348,7 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
         for outcome in outcomes
     ]
     failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
-    times = ["time of the frame"] if has_times else []
+    times = [*(["series"] if has_series else []), *(["time of the frame"] if has_times else [])]
     return html_table(caption, ["name", *times, *shown, *sinks, "time"], rows, failures)
 
 

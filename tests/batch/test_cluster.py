@@ -131,3 +131,13 @@ def test_an_image_that_kills_every_worker_is_a_row_that_says_so(client):
     (failure,) = result.failures
     assert str(failure.error_info) == "KilledWorker: every worker that ran it died"
     assert replace(failure, error_info=None).values == {}
+
+
+def test_a_series_keeps_its_order_and_its_state_on_the_cluster(client):
+    made = cell("def add(x, before):\n    return before + x\n")
+    runner = ep.CompGraphRunner(
+        ep.delay(ep.CompGraph({"add": made["add"]}, {"add": (("x", "before"), "total")}), "total", "before", 0)
+    )
+    keys = ["left", "right"] * 10
+    found = ep.map(runner, list(range(20)), client.get_executor(), series=keys)
+    assert [outcome.values["total"] for outcome in found] == [sum(range(n % 2, n + 1, 2)) for n in range(20)]

@@ -474,3 +474,27 @@ def test_a_group_of_skipped_functions_is_skipped():
     grouped = ep.CompGraphRunner(cg, {"minimum": 5})
     grouped.run(x=3)
     assert {each.name: each.state for each in view(grouped).functions}["marking"] == "skipped"
+
+
+# -- state between runs ---------------------------------------------------------------------------------------------
+
+
+def test_a_delayed_token_says_whose_value_it_has_in_its_title_and_for_screen_readers():
+    cg = ep.CompGraph({"add": lambda x, t: x + t}, {"add": (("x", "before"), "total")})
+    runner = ep.CompGraphRunner(ep.delay(cg, "total", "before", 5))
+    runner.run(x=1)
+    for shown in (runner.cg, runner.plan(), runner.last):
+        bundle = mimebundle(shown)
+        assert "token before, the value of 'total' in the run before" in bundle["image/svg+xml"]
+        assert "<td>value of 'total' in the run before, " in bundle["text/html"]
+    assert "in the run before: int 5, fresh" in to_svg(runner.last)
+
+
+def test_a_delay_within_a_group_is_drawn_when_the_group_is_opened():
+    cg = ep.CompGraph(
+        {"add": lambda x, t: x + t, "double": lambda t: 2 * t},
+        {"add": (("x", "before"), "total"), "double": ("total", "y")},
+    )
+    grouped = ep.group(ep.delay(cg, "total", "before", 5), "sum", functions=["add", "double"])
+    (inside,) = view(grouped).groups
+    assert inside.graph.delays == (("total", "before"),)

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from epypes.batch.check import CheckOutcome, CheckResult, Checks, prepare_cases, run_checks
 from epypes.batch.items import items_of, payload_of, read_value
-from epypes.errors import EpypesError, PayloadError
+from epypes.errors import EpypesError, PayloadError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 from epypes_widgets.history import Entry, History
@@ -168,6 +168,9 @@ def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:
     if not isinstance(runner, CompGraphRunner):
         free = runner.free_source_tokens
         raise PayloadError(free, "A service makes its own events, so it takes no cases. Check its bundle: ep.check().")
+    if runner.state:
+        text = "The graph has state between runs, so a case is a sequence, and no image that a panel can show."
+        raise ScaleError(f"{text} Tune on one, images=[...], and check them all: ep.check(runner, cases).")
     prepared = prepare_cases(runner, cases)
     items = items_of((case.inputs for case, _ in prepared), runner)
     read = []

@@ -14,6 +14,7 @@ from epypes.display import encode_image, is_image
 from epypes.errors import PayloadError, UnknownName
 from epypes.graph import colour_order
 from epypes.images import Order
+from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array
 from epypes_widgets.target import Tunable
 
@@ -113,8 +114,14 @@ def payloads(runner: Tunable, images: Any, titles: Sequence[str] = ()) -> Sequen
         return VideoPayloads(images, token, colour_order(runner.cg, token))
     given = _listed(images)
     values = [_values(runner, free, item, f"images[{place}]") for place, item in enumerate(given)]
+    # Frames of a sequence have a slider, and no pictures to choose among.
+    is_sequence = isinstance(runner, CompGraphRunner) and bool(runner.state)
     return tuple(
-        Payload(titles[place] if titles else _title(payload, place), payload, _thumbnail(runner, payload))
+        Payload(
+            titles[place] if titles else _title(payload, place),
+            payload,
+            b"" if is_sequence else _thumbnail(runner, payload),
+        )
         for place, payload in enumerate(values)
     )
 

@@ -342,13 +342,13 @@ class Panel:
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
-        video, values = self._session.video, json_values(self.values)
-        images = self._session.payloads if video is None else ()
+        frames, values = self._session.frames, json_values(self.values)
+        images = self._session.payloads if frames is None else ()
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
             "images": [{"index": index, "title": image.title} for index, image in enumerate(images)],
-            "video": None if video is None else {"name": video.video.path.name, "numbers": _ends(video.video.numbers)},
+            "frames": None if frames is None else {"name": self._session.frames_name, "numbers": _ends(frames)},
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._controls.thresholds.items()],
             "rois": [
@@ -378,9 +378,10 @@ def _made_from(cg: CompGraph, token: str) -> list[str]:
     return sorted(found)
 
 
-def _searched(given: Sequence[Payload]) -> Any:
-    """Return the inputs that a search looks at; None without any."""
-    return given.video if isinstance(given, VideoPayloads) else [payload.values for payload in given] or None
+def _searched(given: Sequence[Payload], *, is_series: bool) -> Any:
+    """Return the inputs that a search looks at, of a graph with state those of one case; None without any."""
+    inputs = given.video if isinstance(given, VideoPayloads) else [payload.values for payload in given]
+    return ([inputs] if is_series else inputs) if len(inputs) else None
 
 
 def tune(
@@ -407,7 +408,9 @@ def tune(
     images
         Test images to switch between: values of the one free source token, or dicts by token. Or a video, as
         ``ep.video(path)`` or its path: then the panel has a slider of its frames, each of which is read when it is
-        asked for. A service has none.
+        asked for. A service has none. Of a graph with state (``ep.delay``) they are the frames of a sequence, with a
+        slider too: each is shown with the state that runs over all frames before it leave, from the initial state, with
+        the same hyperparameters. What the delayed tokens do not need is not run on those.
     cases
         A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
         shows whether it passes with the values that were committed last. A service has none.
@@ -471,6 +474,7 @@ def tune(
         runner.cg.require_token(token)
     found = read_cases(runner, images, cases)
     given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
+    has_state = isinstance(runner, CompGraphRunner) and bool(runner.state)
     session = Session(runner, given)
     if session.is_service and given:
         runner.trial({}, payload=given[0].values)  # refuses it
@@ -479,7 +483,7 @@ def tune(
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
     control_set = ControlSet(controls(runner, hints))
-    looked_at = [case for case, _ in found] or _searched(given)
+    looked_at = [case for case, _ in found] or _searched(given, is_series=has_state)
     search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
     session.begin()
     return Panel(control_set, session, token, found, store, name, search)

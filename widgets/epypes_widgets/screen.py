@@ -267,8 +267,7 @@ class Screen:
         """Send the last entries; a thumbnail goes to a view once, and is empty from then on."""
         with self._listing:
             entries, current = self._history.entries, self._history.current
-            video = self._session.video
-            numbers = None if video is None else video.video.numbers
+            numbers = self._session.frames
             pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
             pairs = pairs if len(pairs) <= _MAX_ENTRIES else [pairs[0], *pairs[1 - _MAX_ENTRIES :]]

@@ -174,6 +174,10 @@ class Search(Job):
         last = self._runner.last
         if last is None:
             raise ScaleError("Nothing has been run yet, so there is no case. Give some: tune(runner, cases=[...]).")
+        if self._runner.state:
+            raise ScaleError(
+                "The graph has state between runs: give the frames to search on, tune(runner, images=[...])."
+            )
         return [{token: last[token] for token in self._runner.free_source_tokens}]
 
     def _tried(self, trial: Trial) -> None:

@@ -12,6 +12,7 @@ from operator import is_, is_not
 from typing import Any
 
 from epypes.run import CompGraphRunner, Run
+from epypes_widgets.frame_states import FrameStates
 from epypes_widgets.images import Payload, VideoPayloads, is_alike
 from epypes_widgets.target import Tunable
 
@@ -42,11 +43,21 @@ class Session:
         self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
         self.image = self._image_of(runner.last, is_alike)
+        # Of a graph with state the payloads are a sequence: each begins with what those before it leave.
+        self.states: FrameStates | None = None
+        # The frame of ``result`` and the key of the state that it began with.
+        self._begun: tuple[int, object] | None = None
+        # The runner's last run as of ``result``.
+        self._followed: Run | None = None
         self._lock = threading.Lock()
         self._wanted: dict[str, Any] = {}
         self._image_wanted: int | None = None
         self._seen = dict(runner.hyperparameters)
         self._is_closed = False
+        if isinstance(runner, CompGraphRunner) and runner.state and self.payloads:
+            self.states = FrameStates(runner, self.payloads)
+            # Cells may have run this frame with another state.
+            self._image_wanted = self.image or 0
 
     def begin(self) -> None:
         """Have the first payload run if nothing has been; what a function raises on it is raised."""
@@ -96,6 +107,19 @@ class Session:
         return self.payloads if isinstance(self.payloads, VideoPayloads) else None
 
     @property
+    def frames(self) -> range | None:
+        """The numbers of the frames that may be chosen among, of a video or a sequence; None of single images."""
+        video = self.video
+        if video is not None:
+            return video.video.numbers
+        return None if self.states is None else range(len(self.payloads))
+
+    @property
+    def frames_name(self) -> str:
+        """What the frames are of: the name of a video; empty for a sequence."""
+        return "" if self.video is None else self.video.video.path.name
+
+    @property
     def notice(self) -> str:
         """What is wrong with the place where the functions run; empty if nothing is."""
         return "" if isinstance(self.runner, CompGraphRunner) else self.runner.notice
@@ -139,7 +163,14 @@ class Session:
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
-    def bring_up_to_date(self, targets: Sequence[str], *, is_wanted: bool = True) -> tuple[Run, bool]:
+    def bring_up_to_date(
+        self,
+        targets: Sequence[str],
+        *,
+        is_wanted: bool = True,
+        is_superseded: Callable[[], bool] = lambda: False,
+        report: Callable[[str], object] = lambda text: None,
+    ) -> tuple[Run, bool]:
         """Compute what is wanted, as far as the targets need it.
 
         Parameters
@@ -148,6 +179,10 @@ class Session:
             Tokens; everything without.
         is_wanted
             Whether to compute what is wanted; if not, the targets are computed from what the runner has.
+        is_superseded
+            Is asked, while the frames before a frame are run, whether something newer is wanted.
+        report
+            Is called with a line of text if that takes long.
 
         Returns
         -------
@@ -155,17 +190,36 @@ class Session:
             It may have failed; the runner and ``result`` are then what they were.
         bool
             Whether that is settled. If not, the runner was changed meanwhile: it is to be tried again.
+
+        Raises
+        ------
+        Superseded
+            Something newer is wanted.
         """
         with self._lock:
             wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
         payload = None if image is None else self.payloads[image].values
-        run = self.runner.trial(wanted, *targets, payload=payload)
+        last = self.runner.last
+        is_own = last is self._followed
+        present = self.image if is_own else None  # what a cell has run begins as it did there
+        begun: tuple[int, object] | None = None
+        if self.states is not None and (frame := present if image is None else image) is not None:
+            values = {**self.runner.hyperparameters, **wanted}
+            begun = frame, self.states.key(values)
+        if self.states is not None and begun is not None and not (begun == self._begun and is_own):
+            # So that the runner has the state after the frame, too.
+            needed = (*targets, *self.states.targets) if targets else ()
+            run = self.states.trial(begun[0], wanted, *needed, is_superseded=is_superseded, report=report)
+        else:
+            payload = payload if begun is None else None
+            run = self.runner.trial(wanted, *targets, payload=payload)
         if run.failure is not None or self._is_closed:
             return run, True
-        is_new = bool(wanted) or payload is not None or bool(run.report.ran)
+        is_new = bool(wanted) or image is not None or bool(run.report.ran)
         if is_new and not self.runner.adopt(run):
             return run, False
         self._settle(run, wanted, image)
+        self._begun, self._followed = begun, run if is_new else last
         return run, True
 
     def insist(self) -> None:
@@ -177,10 +231,15 @@ class Session:
         else:
             self.runner.put(wanted)
 
-    def compared(self, values: Mapping[str, Any], token: str) -> Run:
-        """Return a run with these hyperparameters, on the present payload; LookupError if it can't be had."""
+    def compared(self, values: Mapping[str, Any], token: str, is_superseded: Callable[[], bool] = lambda: False) -> Run:
+        """Return a run with these hyperparameters, on the present payload; LookupError if it can't be had.
+
+        Of a frame of a sequence it begins with the state that these hyperparameters give; Superseded as above.
+        """
         known = self.runner.hyperparameters
         values = {name: value for name, value in values.items() if name in known}
+        if self.states is not None and self.image is not None:
+            return self.states.trial(self.image, values, token, is_superseded=is_superseded)
         if isinstance(self.runner, CompGraphRunner):
             return self.runner.trial(values, token)
         return self.runner.remembered(values, token)

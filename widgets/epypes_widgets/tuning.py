@@ -17,6 +17,7 @@ from epypes.errors import NotComputed, StillRunning
 from epypes.graph import subgraph
 from epypes.run import Failure, Run
 from epypes_widgets.control_set import ControlSet
+from epypes_widgets.frame_states import Superseded
 from epypes_widgets.frames import thumbnail
 from epypes_widgets.history import Entry, History
 from epypes_widgets.screen import Comparison, Screen
@@ -68,6 +69,7 @@ class Tuning:
         self._settled = settled
         self._lock = threading.Lock()
         self._commits = self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
+        self._has_progress = False
         self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
         for control in controls.controls:
             control.on_change(self._moved)
@@ -75,7 +77,7 @@ class Tuning:
     def begin(self) -> None:
         """Show what the runner has, if that is up to date; else have it computed."""
         last = self.runner.last
-        if last is not None and last.failure is None and not self.runner.stale:
+        if last is not None and last.failure is None and not self.runner.stale and not self.session.is_wanting:
             self.session.result = last
             self.screen.follow(last)
             self.screen.show(last, 0)
@@ -199,6 +201,13 @@ class Tuning:
     def _request(self) -> None:
         self.worker.post("compute", partial(self._compute, perf_counter_ns()))
 
+    def _tell_progress(self, text: str) -> None:
+        self._has_progress = bool(text)
+        self.screen.note(text)
+
+    def _is_superseded(self) -> bool:
+        return self.worker.is_superseded("compute")
+
     def _runner_changed(self) -> None:
         if not self.worker.is_current:
             self.screen.refer_anew()
@@ -238,12 +247,17 @@ class Tuning:
     def _show_run(self, is_wanted: bool, changed_ns: int) -> None:
         try:
             run, is_settled = self._tried(is_wanted)
+        except Superseded:  # what was computed for it is kept, and the newer request is next
+            self._is_forced, self._has_looked = is_wanted, True
+            return
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
             if not self.worker.closed:
                 self._refuse(error)
             return
         if self.worker.closed:
             return
+        if self._has_progress:
+            self._tell_progress("")
         if run.failure is not None:
             self._fail(run, run.failure)
             return
@@ -260,7 +274,12 @@ class Tuning:
 
     def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
         for _ in range(_MAX_ATTEMPTS):
-            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets, is_wanted=is_wanted)
+            run, is_settled = self.session.bring_up_to_date(
+                self.screen.shown.targets,
+                is_wanted=is_wanted,
+                is_superseded=self._is_superseded,
+                report=self._tell_progress,
+            )
             if is_settled:
                 break
             self._follow_others()
@@ -358,7 +377,9 @@ class Tuning:
             return
         try:
             values, label = self._compared(comparison)
-            run = self.session.compared(values, token)
+            run = self.session.compared(values, token, self._is_superseded)
+        except Superseded:
+            return
         except LookupError as error:
             self.screen.log(str(error))
             self.screen.note(str(error))

@@ -58,6 +58,10 @@ class Worker:
         """Whether a request of this key waits or runs."""
         return key in self._waiting or self._running == key
 
+    def is_superseded(self, key: str) -> bool:
+        """Whether a newer request of this key waits for the one that runs, or the worker is closed."""
+        return self._closed or key in self._waiting
+
     def post(self, key: str, request: Callable[[], object], delay_s: float = 0.0, *, is_work: bool = True) -> None:
         """Have a request run after a delay, in place of one that waits under the same key; after ``close`` nothing is.
 

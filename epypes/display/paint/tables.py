@@ -226,7 +226,8 @@ def _function_row(function: FunctionView, inputs: str, outputs: str) -> str:
 
 @lru_cache(_MOST_KEPT)
 def _token_row(token: TokenView) -> str:
-    return _twin_row(token.name, token.preview.detail if token.preview else "", f"{token.role}, {token.state}")
+    role = f"value of {token.delayed!r} in the run before" if token.delayed else token.role
+    return _twin_row(token.name, token.preview.detail if token.preview else "", f"{role}, {token.state}")
 
 
 def _stage_row(stage: StageView) -> str:

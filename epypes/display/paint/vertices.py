@@ -281,7 +281,8 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
         state += f", first {token.first}"
     states = (token.role, *_classes(token.state), *(("changed",) if token.first else ()))
     noun = "hyperparameter token" if token.role == "hyperparameter" else "token"
-    title = f"{noun} {cut_name(token.name, _TITLE_CHARACTERS)}{state}"
+    delayed = f", the value of {cut_name(token.delayed, _TITLE_CHARACTERS)!r} in the run before" * bool(token.delayed)
+    title = f"{noun} {cut_name(token.name, _TITLE_CHARACTERS)}{delayed}{state}"
     return vertex("token", token.name, states, title, body, thumbnail)
 
 

@@ -38,6 +38,8 @@ class TokenView(NamedTuple):
         The text of the first value of a hyperparameter that has another one now; empty for all other tokens.
     order_by
         The function that says the order; empty if it is assumed.
+    delayed
+        The token whose value in the run before it has; empty for all other tokens.
     """
 
     name: str
@@ -47,6 +49,7 @@ class TokenView(NamedTuple):
     order: Order = "bgr"
     first: str = ""
     order_by: str = ""
+    delayed: str = ""
 
 
 class FunctionView(NamedTuple):

@@ -191,6 +191,7 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
     new_function = {place: new for new, place in enumerate(places)}
     edges = [edge for edge in graph.edges if edge.function in new_function]
     new_token = {token: new for new, token in enumerate(sorted({edge.token for edge in edges}))}
+    names = {graph.tokens[token].name for token in new_token}
     return GraphView(
         tuple(graph.functions[place] for place in places),
         tuple(
@@ -198,6 +199,7 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
         ),
         tuple(edge._replace(function=new_function[edge.function], token=new_token[edge.token]) for edge in edges),
         direction=graph.direction,
+        delays=tuple(pair for pair in graph.delays if names.issuperset(pair)),
     )
 
 

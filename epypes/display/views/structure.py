@@ -14,7 +14,14 @@ from weakref import WeakKeyDictionary
 from epypes.display.previews.preview import preview
 from epypes.display.previews.short import without_addresses
 from epypes.display.text import cut
-from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenState, TokenView
+from epypes.display.views.graphview import (
+    EdgeView,
+    FunctionState,
+    FunctionView,
+    GraphView,
+    TokenState,
+    TokenView,
+)
 from epypes.graph import (
     ASSUMED,
     CompGraph,
@@ -118,8 +125,9 @@ def _token_view(cg: CompGraph, token: str, choices: _Choices, unread: Mapping[st
         consumers = cg.digraph.consumers[token]
         is_left_out = all(name in left_out or (name in branches and token in unread[name]) for name in consumers)
     found = cg.colours.get(token, ASSUMED)
+    delayed = cg.delays[token].token if token in cg.delays else ""
     state: TokenState = "left out" if is_left_out else "static"
-    return TokenView(token, "payload", state, order=found.order, order_by=found.function)
+    return TokenView(token, "payload", state, order=found.order, order_by=found.function, delayed=delayed)
 
 
 def _edges(cg: CompGraph, left_out: Collection[str], unread: Mapping[str, frozenset[str]]) -> Iterator[EdgeView]:

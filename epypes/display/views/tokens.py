@@ -107,7 +107,8 @@ def token_views(
         name, is_hyperparameter = token.name, token.name in hparams.values
         state = token.state if token.state == "left out" else "fresh" if is_hyperparameter else state_of(name)
         role = "hyperparameter" if is_hyperparameter else token.role
-        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""), token.order_by)
+        before, by = token.delayed, token.order_by
+        return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""), by, before)
 
     return tuple(map(view, structure.tokens)), dropped
 

@@ -110,14 +110,14 @@ export function filmsPart(panel) {
   };
 }
 
-/** The frames of a video that the graph can be tuned on. */
+/** The frames of a video or a sequence that the graph can be tuned on. */
 export function videoPart(panel) {
   const slider = element("input", "epypes-frames", { type: "range", min: "0", step: "1", "aria-label": "Frame of the video" });
   const before = iconButton("before", "Frame before", () => go(slider.valueAsNumber - 1), "epypes-frame-before");
   const after = iconButton("after", "Next frame", () => go(slider.valueAsNumber + 1), "epypes-frame-after");
   const text = element("span", "epypes-frame-text");
-  const root = element("div", "epypes-video", { role: "group", "aria-label": "Video", hidden: "" }, before, slider, after, text);
-  let video = null;
+  const root = element("div", "epypes-video", { role: "group", "aria-label": "Frames", hidden: "" }, before, slider, after, text);
+  let frames = null;
   /** The index of the frame that was shown last, and its time. */
   let shown = { image: null, time_s: null };
 
@@ -128,15 +128,16 @@ export function videoPart(panel) {
   }
 
   function describe() {
-    const { start, step, count } = video.numbers;
+    const { start, step, count } = frames.numbers;
     const index = slider.valueAsNumber;
     const number = start + step * index;
     // No frame is shown while the payload is another one, as that of a cell.
     const isShown = shown.image === index;
-    const time = isShown && shown.time_s !== null ? `${shown.time_s.toFixed(3)} s` : "…";
-    say(text, `frame ${number} of ${video.name} · ${time}`);
-    note(text, "title", `${video.name}: ${count} frames`);
-    note(slider, "aria-valuetext", `frame ${number}, ${time}`);
+    // A sequence has no times.
+    const time = !isShown ? "…" : shown.time_s === null ? "" : `${shown.time_s.toFixed(3)} s`;
+    say(text, `frame ${number} of ${frames.name || "the sequence"}${time && " · "}${time}`);
+    note(text, "title", `${frames.name || "Sequence"}: ${count} frames`);
+    note(slider, "aria-valuetext", `frame ${number}${time && ", "}${time}`);
     before.disabled = index <= 0;
     after.disabled = index >= count - 1;
   }
@@ -147,14 +148,15 @@ export function videoPart(panel) {
   return {
     element: root,
     setup(message) {
-      video = message.video ?? null;
-      root.hidden = !video;
-      if (!video) return;
-      slider.max = video.numbers.count - 1;
+      frames = message.frames ?? null;
+      root.hidden = !frames;
+      if (!frames) return;
+      slider.max = frames.numbers.count - 1;
+      note(slider, "aria-label", `Frame of the ${frames.name ? "video" : "sequence"}`);
       describe();
     },
     frame({ frame }) {
-      if (!video) return;
+      if (!frames) return;
       shown = { image: frame.image, time_s: frame.time_s };
       if (frame.image !== null && panel.takes(FRAME, frame.image)) slider.value = frame.image;
       describe();
