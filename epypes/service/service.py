@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import threading
@@ -14,6 +15,7 @@ from epypes.service.bundle_info import read_bundle_info
 from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import AnswerOutput, Endpoints, EventInput, group_address
+from epypes.service.event_states import StateChoice, why_refused
 from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
@@ -29,11 +31,14 @@ from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack
+    from epypes.service.worker_connection import WorkerConnection
 
 # The share of a drain's time for working on accepted events; the rest is for reporting others, and for closing.
 _DRAIN_SHARE: Final = 0.7
 _CHANGE_TIMEOUT_S: Final = 10.0
 _JOINING: Final = "joining the replicas"
+
+_log = logging.getLogger("epypes.service")
 
 
 class Service:
@@ -80,7 +85,13 @@ class Service:
         self._parameters = ParameterControl(bundle, self._dispatcher, self._results.notify, change_timeout_s)
         self._lifecycle = Lifecycle(self._dispatcher, self._endpoints, self._results, lambda: self._supervisor.health)
         self._supervisor = Supervisor(
-            self._dispatcher, bundle, given.threads, given.job_timeout_s, self._parameters, self._lifecycle.check
+            self._dispatcher,
+            bundle,
+            given.threads,
+            given.job_timeout_s,
+            self._parameters,
+            self._lifecycle.check,
+            self._why_refused,
         )
         self._queries = WorkerQueries(lambda: self._supervisor.bundle, lambda: self._dispatcher.connection)
         self._deployer = Deployer(
@@ -90,7 +101,7 @@ class Service:
             group_address(given),
             self._facts,
             self._parameters,
-            lambda: self._dispatcher.release(_JOINING),
+            self._joined,
         )
         self._parameters.newest = self._replicas.newest
         self._started_ns = 0
@@ -115,6 +126,7 @@ class Service:
                 self._lifecycle.is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
+                self._dispatcher.reset_state()
                 if self._replicas.is_shared:
                     # Until the parameters of the other replicas are known.
                     self._dispatcher.hold(_JOINING)
@@ -259,6 +271,7 @@ class Service:
             "started_ns": self._started_ns,
             "restarts": self._supervisor.health.restarts,
             "counts": self.counts(),
+            "states": self._dispatcher.describe_states(),
         }
 
     def listen(self, callback: Listener) -> Callable[[], None]:
@@ -287,6 +300,19 @@ class Service:
         bundle, current = self._supervisor.bundle, self._parameters.current
         return Provenance(bundle.settings.name, str(bundle.path), bundle.digest, current.revision, current.entries)
 
+    def _why_refused(self, worker: WorkerConnection) -> str:
+        """Return why a worker's bundle can't be served with these options; empty if it can."""
+        return why_refused(worker.about.get("delays", {}), self.options, self._replicas.others())
+
+    def _joined(self) -> None:
+        """Work on events, now that the other replicas are known; unless the bundle can't be served beside them."""
+        with self._dispatcher.lock:
+            worker = self._dispatcher.connection
+            if worker is not None and (reason := self._why_refused(worker)):
+                self._supervisor.refuse(worker, reason)
+        self._dispatcher.release(_JOINING)
+        self._dispatcher.publish()
+
     # -- operation ----------------------------------------------------------------------------------------------------
 
     def pause(self) -> None:
@@ -310,23 +336,32 @@ class Service:
             self._lifecycle.leave(timeout_s)
         return is_done
 
-    def deploy(self, path: str | Path) -> dict[str, Any]:
+    def deploy(self, path: str | Path, state: StateChoice | None = None) -> dict[str, Any]:
         """Serve another bundle from now on; return `info`, and which values changed.
 
         A second worker proves it beside the first one, and gets the events when none is worked on. It has its own
         parameters, with the next revision: ``changed`` has a line for each value that differs, as
-        ``"sigma 1.4 -> 1.0 (tuned, not written back)"``.
+        ``"sigma 1.4 -> 1.0 (tuned, not written back)"``, and one that says whether the state between events is kept.
+
+        Parameters
+        ----------
+        path
+            The bundle.
+        state
+            Whether to ``"keep"`` or ``"reset"`` the state between events. Without, it is kept if both bundles delay the
+            same tokens with the same initial values.
 
         Raises
         ------
         DeployRefused
-            It does not compute what was recorded, or has other ports; the bundle that is served goes on.
+            It does not compute what was recorded, or has other ports, or can't keep the state; the bundle that is
+            served goes on.
         ServiceError
             A deploy, a rollback or a write-back is running already.
         """
-        return {"changed": self._deployer.deploy(path), **self.info()}
+        return {"changed": self._deployer.deploy(path, state), **self.info()}
 
-    def rollback(self) -> dict[str, Any]:
+    def rollback(self, state: StateChoice | None = None) -> dict[str, Any]:
         """Serve the bundle again that was served before; return what `deploy` returns.
 
         The bundle that is left is the one before then, so a second rollback undoes the first.
@@ -336,7 +371,29 @@ class Service:
         DeployRefused
             There was none, or it was changed since.
         """
-        return {"changed": self._deployer.rollback(), **self.info()}
+        return {"changed": self._deployer.rollback(state), **self.info()}
+
+    def reset(self, source: str | None = None) -> int:
+        """Have the next event begin with the initial state, as if it were the first; return how many states were reset.
+
+        Parameters
+        ----------
+        source
+            Whose state; every state without.
+
+        Raises
+        ------
+        UnknownName
+            There is no state of this source.
+        ServiceError
+            The bundle has no state between events; or all sources have one.
+        """
+        if not self._dispatcher.describe_states():
+            text = "There is nothing to reset: no bundle with state between events (ep.delay) is served."
+            raise ServiceError(self._supervisor.bundle.path, text)
+        count = self._dispatcher.reset_state(source)
+        _log.info("the state %s is reset", "between events" if source is None else f"of source {source!r:.80}")
+        return count
 
     # -- its parameters ---------------------------------------------------------------------------------------------
 

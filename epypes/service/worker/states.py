@@ -1,0 +1,79 @@
+"""State between events, in the worker: what each series of events has left, for the slots that go on with it.
+
+The front says with each event which series it belongs to, and where its state is: ``"held"`` here since the event
+before, ``"initial"``, or ``"given"`` as the last frame of the message. Events of one series come one after the other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import MessageError
+from epypes.service.packing import BytesLike, pack_state, unpack_state
+
+if TYPE_CHECKING:
+    from epypes.graph import CompGraph
+    from epypes.pipeline import Pipeline
+    from epypes.service.frame_socket import WorkerMessage
+
+# The values by key, as `CompGraphRunner.state`; None for the initial state.
+State = Mapping[str, Any] | None
+_DIGEST_CHARACTERS: Final = 16
+
+
+def describe_delays(pipeline: Pipeline) -> dict[str, list[str]]:
+    """Return, by key of the state, the token that is delayed and a digest of the initial value; empty without state.
+
+    Called before the first event.
+    """
+    return {key: [_delayed(pipeline.cg, key), _digest(key, value)] for key, value in pipeline.state.items()}
+
+
+def _delayed(cg: CompGraph, key: str) -> str:
+    """Return the token that is delayed under a key, which begins with the names of nested pipelines."""
+    if key in cg.delays:
+        return cg.delays[key].token
+    name, function = next((each for each in cg.functions.items() if key.startswith(f"{each[0]}.")), ("", None))
+    inner = getattr(function, "cg", None)
+    return "" if inner is None else f"{name}.{_delayed(inner, key.removeprefix(f'{name}.'))}"
+
+
+def _digest(key: str, value: Any) -> str:
+    try:
+        block = pack_state({key: value})
+    except MessageError:
+        # The first event fails, which says why.
+        return type(value).__name__
+    return hashlib.sha256(block).hexdigest()[:_DIGEST_CHARACTERS]
+
+
+class WorkerStates:
+    """The states of all series of events; slots share it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        # By key: the number of the last event, and the state that it begins with or has left.
+        self._kept: dict[str, tuple[int, State]] = {}
+
+    def begin(self, message: WorkerMessage) -> tuple[State, Sequence[BytesLike]]:
+        """Return the state that an event begins with, and the frames of the event."""
+        seq, key, where, frames = message.number, message.content["key"], message.content["state"], message.frames
+        given: State = None
+        if where == "given":
+            *frames, block = frames
+            given = unpack_state(block)
+        with self._lock:
+            for other, last_seq in message.content.get("forget", {}).items():
+                if other in self._kept and self._kept[other][0] <= last_seq:
+                    del self._kept[other]
+            state = self._kept[key][1] if where == "held" else given
+            self._kept[key] = seq, state
+        return state, frames
+
+    def keep(self, message: WorkerMessage, state: State) -> None:
+        """Keep what an event has left; after a failed one, what it began with."""
+        with self._lock:
+            self._kept[message.content["key"]] = message.number, state
