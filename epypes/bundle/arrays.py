@@ -22,7 +22,9 @@ HYPERPARAMETERS: Final = "hyperparameters"
 READER: Final = "stored_array"
 _READER_TEXT: Final = '''def {reader}(name):
     """Return an array that this bundle keeps as a file; it can't be written to."""
-    array = {numpy}.load({pathlib}.Path(__file__).with_name("{folder}") / f"{{name}}.npy", allow_pickle=False)
+    array = {numpy}.load(
+        {pathlib}.Path(__file__).with_name("{folder}") / f"{{name}}.npy", allow_pickle=False
+    )
     array.flags.writeable = False
     return array'''
 _LONGEST_NAME: Final = 80

@@ -15,7 +15,7 @@ from epypes.bundle.adapters import answer_with, payload_of
 from epypes.bundle.arrays import StoredArray, read_array
 from epypes.bundle.manifest import MODULE, REQUIREMENTS, SAMPLES, SETTINGS, bundle_files, check_manifest
 from epypes.bundle.mutable_state import MutableState
-from epypes.bundle.settings import Settings, read_settings
+from epypes.bundle.settings import Settings, read_settings, states_of
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
 from epypes.pipeline import FullPipeline
@@ -23,6 +23,7 @@ from epypes.run import CompGraphRunner
 from epypes.run.guard import called_for
 
 MAKER: Final = "make_pipeline"
+WITH_DELAYS: Final = "with_delays"
 # Two bundles of one name must not take each other's place among the modules.
 _EXECUTING: Final = threading.RLock()
 
@@ -116,6 +117,10 @@ def read_bundle(path: str | Path, *, compare: bool = True) -> Bundle:
     adapters = {name: adapter for name, adapter in own.items() if name != MAKER}
     state = MutableState({**module.func_dict, **adapters}, values)
     cg = _graph(module, state.guarded(module.func_dict), settings)
+    if states_of(cg) != settings.states:
+        names = ", ".join(map(repr, states_of(cg).items() ^ settings.states.items()))
+        text = f"{folder / SETTINGS} and {MODULE} name other states between runs: {names}. Promote the graph again."
+        raise BundleError(folder, text)
     own |= {name: called_for(name, adapter) for name, adapter in state.guarded(adapters).items()}
     return Bundle(folder, cg, replace(settings, hyperparameters=values), digest, own, enums)
 
@@ -139,6 +144,8 @@ def _graph(module: Any, functions: Mapping[str, Callable[..., Any]], settings: S
     if settings.has_groups:
         for name, functions in module.func_groups.items():
             cg = group(cg, name, functions)
+    if settings.states and hasattr(module, WITH_DELAYS):  # a nested pipeline has its own
+        cg = module.with_delays(cg)
     return with_defaults(cg, settings.defaults)
 
 
@@ -170,7 +177,7 @@ def execute(path: Path, source: bytes) -> Any:
 
 
 def load(path: str | Path) -> CompGraphRunner:
-    """Return a runner with a bundle's graph and hyperparameters.
+    """Return a runner with a bundle's graph and hyperparameters, and the initial state of its delays.
 
     Raises
     ------
@@ -182,7 +189,7 @@ def load(path: str | Path) -> CompGraphRunner:
 
 
 def load_pipeline(path: str | Path, q_in: Any, q_out: Any) -> FullPipeline:
-    """Return the FullPipeline that ``epypes serve`` runs.
+    """Return the FullPipeline that ``epypes serve`` runs; its delays begin with their initial values.
 
     Parameters
     ----------

@@ -16,8 +16,17 @@ from typing import Any, Final
 from epypes.bundle.arrays import ArrayFiles
 from epypes.bundle.clone import arguments_of, parameters_of
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.expressions import LINE, bracketed, escaped, expression_or_none, laid_out, names_in, quoted
-from epypes.bundle.load import MAKER
+from epypes.bundle.expressions import (
+    LINE,
+    bracketed,
+    escaped,
+    expression_or_none,
+    identifier_of,
+    laid_out,
+    names_in,
+    quoted,
+)
+from epypes.bundle.load import MAKER, WITH_DELAYS
 from epypes.bundle.objects import without_nodes
 from epypes.bundle.resolve import Position, Refused, parsed
 from epypes.bundle.settings import Settings, members_in
@@ -32,6 +41,10 @@ _GIVEN: Final = ("cg", "q_in", "q_out", "f_in", "f_out", "hparams")
 _NOT_MADE_AGAIN: Final = (
     "is made with a {kind} that no expression makes again. Make it in __init__, from numbers, strings, a small array "
     "or tuples of them."
+)
+_NO_INITIAL: Final = (
+    "is of type {kind}, and no expression makes it again. Begin with None, and make it in the function when it gets "
+    "None: {}."
 )
 _ADAPTER_COMMENTS: Final = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
 # The folder is wherever the bundle is: it may be moved.
@@ -70,8 +83,9 @@ def write_module(
     members = [member for value in values for member in members_in(value)]
     enums = {type(member).__qualname__: type(member) for member in members if isinstance(member, enum.Enum)}
     own = {MAKER: pipeline is not None, "enums": bool(enums), "func_groups": settings.has_groups}
+    own[WITH_DELAYS] = bool(settings.states)
 
-    def write(gathered: Slice) -> dict[str, str]:
+    def write(gathered: Slice) -> tuple[dict[str, str], str]:
         graphs, definitions = Graphs(gathered), gathered.definitions
         references = graphs.write(cg)
         for name, adapter in adapters.items():
@@ -86,13 +100,13 @@ def write_module(
         kinds = {name: graphs.value(kind, f"Class {name!r} of a hyperparameter", name) for name, kind in enums.items()}
         if kinds:
             definitions["enums"] = f"# Whose members stand in pipeline.toml.\n{_dict('enums', kinds)}"
-        return references
+        return references, graphs.with_delays(cg)
 
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
-    gathered, references = gather(write, reserved, stores_arrays=True)
+    gathered, (references, delays) = gather(write, reserved, stores_arrays=True)
     if gathered.refusals:
         return "", gathered.arrays, list(dict.fromkeys(gathered.refusals))
-    module = emit_module(settings, cg, gathered, references)
+    module = emit_module(settings, cg, gathered, references, delays)
     why = refusal(module, functools.partial(_pairs, cg, adapters, pipeline, enums), gathered.arrays)
     return module, gathered.arrays, [why] if why else []
 
@@ -105,6 +119,9 @@ def _pairs(
         yield f"Function {name!r}", function, module.func_dict[name]
     for name, adapter in adapters.items():
         yield f"Function {name!r}", adapter, getattr(module, name)
+    delays = module.with_delays(CompGraph(module.func_dict, module.func_io, types=False)).delays if cg.delays else {}
+    for previous, delay in cg.delays.items():
+        yield f"The initial value of {previous!r}", delay.initial, delays[previous].initial
     for name, kind in enums.items():
         yield f"Class {name!r}", kind, module.enums[name]
     if pipeline is not None:
@@ -116,7 +133,9 @@ def _pairs(
             yield f"Class of pipeline {pipeline.name!r}", type(pipeline), type(made).__bases__[1]
 
 
-def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Mapping[str, str]) -> str:
+def emit_module(
+    settings: Settings, cg: CompGraph, needed: Slice, references: Mapping[str, str], delays: str = ""
+) -> str:
     """Return the text of ``pipeline.py``.
 
     Parameters
@@ -129,6 +148,8 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
         What its functions need, and what the bundle has of its own.
     references
         By function the expression that refers to it.
+    delays
+        The text of the function that adds the delays, if there are any.
     """
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
     titles = [escaped(f"The computational graph {settings.name}{more}.") for more in (f": {ends}", "")]
@@ -141,7 +162,8 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
     if cg.groups:
         groups = {name: bracketed([*part], quoted) for name, part in cg.groups.items()}
         blocks.append(f"# Drawn as one box each.\n{_dict('func_groups', groups)}")
-    return module_text(needed, "\n\n".join(blocks), head)
+    tail = "\n\n".join(blocks)
+    return module_text(needed, f"{tail}\n\n\n{delays}" if delays else tail, head)
 
 
 def _dict(variable: str, items: Mapping[str, str]) -> str:
@@ -242,7 +264,27 @@ class Graphs:
         source = f"{epypes}.CompGraph({', '.join(variables)}{'' if cg.types else ', types=False'})"
         for group, members in cg.groups.items():
             source = f"{epypes}.group({source}, {quoted(group)}, functions={bracketed([*members], quoted)})"
+        for previous in cg.delays:
+            source = self._delayed(source, cg, previous, f" of {what[0].lower()}{what[1:]}", f"{name}_{previous}")
         return source
+
+    def with_delays(self, cg: CompGraph) -> str:
+        """Return the function that adds the delays to the graph; "" if there are none."""
+        variable = identifier_of("cg", self.gathered.is_taken)
+        lines = [f"def {WITH_DELAYS}({variable}):"]
+        lines += ['    """Return the graph with its state: what each run finds as the one before has left it."""']
+        for previous in cg.delays:
+            lines += laid_out(self._delayed(variable, cg, previous, "", previous), 1, f"{variable} = ")
+        return "\n".join([*lines, f"    return {variable}"]) if cg.delays else ""
+
+    def _delayed(self, source: str, cg: CompGraph, previous: str, where: str, wanted: str) -> str:
+        """Return the expression of a graph with one delay more; ``wanted`` names the array that it may begin with."""
+        token, initial = cg.delays[previous]
+        what = f"The initial value of {previous!r}{where}"
+        way_out = f"ep.delay(cg, {quoted(token)}, {quoted(previous)}, initial=None)"
+        value = expression_or_none(self.gathered, initial, what, _NO_INITIAL.format(way_out, kind="{kind}"), wanted)
+        epypes = self.gathered.module_name("epypes", what)
+        return f"{epypes}.delay({source}, {quoted(token)}, {quoted(previous)}, initial={value})"
 
     def maker(self, pipeline: Pipeline) -> str:
         """Return the function that makes the pipeline of a user's class; of one that takes no events, one that does.

@@ -249,6 +249,7 @@ def _graph(cg: CompGraph) -> Description:
     parts += ((f" function {name!r}", function) for name, function in cg.functions.items())
     parts += ((f" io of {name!r}", io) for name, io in cg.func_io.items())
     parts += ((f" default of {token!r}", value) for token, value in cg.defaults.items())
+    parts += ((f" delay of {token!r}", (delay.token, delay.initial)) for token, delay in cg.delays.items())
     return Description("graph", parts=parts)
 
 

@@ -30,7 +30,7 @@ from epypes.bundle.load import MAKER, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, MODULE, SAMPLES, SETTINGS, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
 from epypes.bundle.resolve import Refused
-from epypes.bundle.settings import MOST_NUMBERS, Settings, unwritable, writable_defaults, write_settings
+from epypes.bundle.settings import MOST_NUMBERS, Settings, states_of, unwritable, writable_defaults, write_settings
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
 from epypes.graph import colour_order
 from epypes.optional import optional_import
@@ -160,6 +160,7 @@ def _write(
     settings = Settings(
         target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
         own=(*adapters, *([MAKER] if pipeline is not None else ())), attributes=attributes, has_groups=bool(cg.groups),
+        states=states_of(cg),
     )  # fmt: skip
     reasons = [*_unready(runner, wanted), *unwritable(hyperparameters), *unwritable(attributes, "Attribute")]
     module, arrays, refusals = write_module(cg, settings, adapters, pipeline)

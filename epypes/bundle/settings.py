@@ -25,6 +25,7 @@ from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes.images import Order
 from epypes.optional import optional_import
+from epypes.pipeline import Pipeline
 from epypes.run.guard import is_plain_array
 
 # What a person still reads, and a line of a diff still shows.
@@ -36,6 +37,7 @@ _LINE: Final = 100
 _COMMENT: Final = (
     "What the graph in pipeline.py is run with. The manifest covers it: change a value in the notebook and promote."
 )
+_STATES: Final = "What an event finds as the one before has left it, with the token that leaves it. No event brings it."
 _UNWRITABLE: Final = (
     "is {}, which pipeline.toml can't hold. Use numbers, strings, a small array or tuples, lists and dicts of them; "
     "make it in a function"
@@ -90,6 +92,9 @@ class Settings:
         The pipeline's attributes.
     has_groups
         Whether the module says which functions are drawn as one box.
+    states
+        The state between runs: by key of ``runner.state``, the delayed token; of a nested pipeline, both after the
+        function's name and a dot. It begins with the initial values in the module.
     entries
         The hyperparameters as they stand in the file: value and kind, range, unit; ready for JSON. Empty before that.
     """
@@ -105,6 +110,7 @@ class Settings:
     own: tuple[str, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
     has_groups: bool = False
+    states: Mapping[str, str] = field(default_factory=dict)
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def order(self, token: str) -> Order:
@@ -132,6 +138,15 @@ def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict
     return {token: value for token, value in cg.defaults.items() if token in hyperparameters and fits(value)}
 
 
+def states_of(cg: CompGraph) -> dict[str, str]:
+    """Return the state between runs of a graph and its nested pipelines, as ``Settings.states`` has it."""
+    found = {previous: delay.token for previous, delay in cg.delays.items()}
+    for name, function in cg.functions.items():
+        if isinstance(function, Pipeline):
+            found |= {f"{name}.{key}": f"{name}.{token}" for key, token in states_of(function.cg).items()}
+    return found
+
+
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     """Write pipeline.toml, with a comment per section and the ranges that annotations and usual names give."""
     with optional_import():
@@ -145,6 +160,8 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     document.add(tomlkit.comment(_COMMENT))
     document.add("bundle", _table(bundle))
     document.add("ports", _table(ports))
+    if settings.states:
+        document.add("states", _table(settings.states, _STATES))
     for section in ("hyperparameters", "defaults", "attributes"):
         tables = tomlkit.table(is_super_table=True)
         for name, value in getattr(settings, section).items():
@@ -245,6 +262,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
             _strings(ports.get("own", [])),
             _values(document.get("attributes", {}), enums),
             bundle.get("groups", False) is True,
+            _texts(document.get("states", {})),
             entries,
         )
     except KeyError as error:
@@ -259,6 +277,12 @@ def _strings(values: Sequence[Any]) -> tuple[str, ...]:
     if len(set(values)) < len(values):
         raise TypeError(f"{values!r} names a token twice")
     return tuple(values)
+
+
+def _texts(entries: Mapping[str, Any]) -> dict[str, str]:
+    if not isinstance(entries, dict) or not all(isinstance(value, str) for value in entries.values()):
+        raise TypeError(f"{entries!r} is no table of token names")
+    return entries
 
 
 def _values(entries: Mapping[str, Any], enums: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import pickle
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from time import perf_counter_ns
 from typing import Any, Final
 
 import numpy as np
@@ -157,10 +158,10 @@ class Component(FullPipeline):
     def put(self, answer: Any, view: EventView) -> None:
         """Put an answer with its times on q_out."""
         # Read before anything else: to write the times is no part of them.
-        put_ns = view.now_ns()
+        put_ns = perf_counter_ns()
         stamps = view.stamps
         times_ns = {
-            "t_pub": put_ns,
+            "t_pub": view.unix_ns(put_ns),
             "t_react": stamps.react_ns,
             "t_fin_start": stamps.f_in_start_ns,
             "t_fin_end": stamps.f_in_end_ns,

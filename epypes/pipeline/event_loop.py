@@ -209,7 +209,7 @@ class EventLoop:
         return not thread.is_alive()
 
     def _loop(self, stop: threading.Event) -> None:
-        is_stopped, poll_s = stop.is_set, POLL_S
+        is_stopped, poll_s, handle = stop.is_set, POLL_S, self._reaction()
         while not is_stopped():
             try:
                 event = self.q_in.get(timeout=poll_s)
@@ -223,7 +223,7 @@ class EventLoop:
                 stop.wait(POLL_S)
                 continue
             try:
-                self._handle(event)
+                handle(event)
             except BaseException as exception:  # a function's SystemExit must not end the thread in silence
                 self._report(event, exception)
                 self._settle(event, exception)
@@ -235,13 +235,12 @@ class EventLoop:
             del event
             self.handled += 1
 
-    def _handle(self, event: Any) -> None:
+    def _reaction(self) -> Callable[[Any], object]:
+        """Return what is called with each event."""
+        f_in, callback = self.f_in, self.callback
         if self._pipeline is not None:
-            self._pipeline._react(event, self.f_in)
-        elif self.f_in is None:
-            self.callback(event)
-        else:
-            self.callback(**self.f_in(event))
+            return self._pipeline._reaction(f_in)
+        return callback if f_in is None else lambda event: callback(**f_in(event))
 
     def _settle(self, event: Any, exception: BaseException | None) -> None:
         if self._pipeline is None or not self._pipeline._has_settled(event):

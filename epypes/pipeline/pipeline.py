@@ -168,12 +168,9 @@ class Pipeline(Node, TokenMapping):
 
     # What an EventLoop asks of its pipeline.
 
-    def _react(self, event: Any, f_in: Callable[[Any], Mapping[str, Any]] | None) -> None:
-        """Run for an event; without f_in it is the only input."""
-        if f_in is None:
-            self(event)
-        else:
-            self.run(**f_in(event))
+    def _reaction(self, f_in: Callable[[Any], Mapping[str, Any]] | None) -> Callable[[Any], object]:
+        """Return what is called with each event: without f_in the event is the only input."""
+        return self if f_in is None else lambda event: self.run(**f_in(event))
 
     def _has_settled(self, event: Any) -> bool:
         """Whether the pipeline has acknowledged or rejected the event itself."""

@@ -288,15 +288,18 @@ class SinkPipeline(Pipeline):
         self._settled = threading.local()
         self.loop = EventLoop(q_in, self)
 
-    def _react(self, event: Any, f_in: FIn | None) -> None:
+    def _reaction(self, f_in: FIn | None) -> Callable[[Any], object]:
         if f_in is None:
-            self.handle(event)
-            return
-        self._f_ins[get_ident()] = f_in
-        try:
-            self.handle(event)
-        finally:
-            del self._f_ins[get_ident()]
+            return self.handle
+
+        def react(event: Any) -> None:
+            self._f_ins[get_ident()] = f_in
+            try:
+                self.handle(event)
+            finally:
+                del self._f_ins[get_ident()]
+
+        return react
 
     @property
     def working_on(self) -> Any:

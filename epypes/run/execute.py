@@ -13,6 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from contextvars import copy_context
 from functools import partial
+from math import inf
 from sys import getrefcount
 from time import perf_counter_ns
 from types import BuiltinFunctionType
@@ -75,6 +76,8 @@ class Executor:
         self._kinds: list[type] = []
         # Checked for changes to their inputs, functions that share one run one after another.
         self.may_use_threads = workers > 1 and not program.check_mutation and has_independent_steps(program)
+        # Threads can gain nothing in a run that takes less.
+        self.short_ns = _MIN_GAIN_NS if self.may_use_threads else inf
         self._gains: dict[Hashable, Gain] = {}
 
     def execute(
@@ -150,7 +153,7 @@ class Executor:
 
     def whole(self, plain: frozenset[str]) -> CompiledRun | None:
         """Return the compiled run of every step from scratch, if there is one that needs no look at what is wanted."""
-        is_simple = not self.may_use_threads and not self._program.switches and not self._program.placeholders
+        is_simple = not self._program.switches and not self._program.placeholders
         return self.repeated.get((plain, None, None, ())) if is_simple else None
 
     def _gain(self, key: Hashable) -> Gain:

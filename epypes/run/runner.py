@@ -183,13 +183,14 @@ class CompGraphRunner(TokenMapping):
         trial_of: TrialOf | None,
         state: Sequence[Any] | None = None,
     ) -> Run:
-        """Run what the targets need, everything without, on a payload and a state: the runner's own if none is given."""
+        """Run what the targets need, everything without, on a payload and a state, by default the runner's own."""
         self._require_targets(targets)
         tokens = self._beginning(hparams, payload, self._kept if state is None else state)
         try:
             return self._run(tokens, hparams, targets, payload, start_ns, trial_of)
         finally:
-            if hparams.repeated is None and (compiled := self._executor.whole(hparams.plain)) is not None:
+            is_short = perf_counter_ns() - start_ns < self._executor.short_ns
+            if hparams.repeated is None and is_short and (compiled := self._executor.whole(hparams.plain)) is not None:
                 hparams.repeated = compiled, hparams.base, hparams.free_slots
 
     def _beginning(self, hparams: Hyperparameters, payload: Payload, state: Sequence[Any]) -> TokenManager:
@@ -293,7 +294,10 @@ class CompGraphRunner(TokenMapping):
             tokens = TokenManager.of_run(program, values, dirty or bytearray(program.clean), True, revisions)
             tokens.running, tokens.origin = getattr(run, "running", 0), origin
             return self._end(self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error), trial_of)
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1
+        total_ns = perf_counter_ns() - start_ns
+        if total_ns > self._executor.short_ns:
+            hparams.repeated = None
+        times = program, wanted, durations_ns, total_ns, False, -1
         # Without targets everything is up to date then.
         left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
         run.record = values, left_dirty, True, revisions, hparams, times, None

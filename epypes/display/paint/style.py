@@ -62,8 +62,6 @@ _RULES: Final = {
     " .tip": "fill:@line",
     " .off": "opacity:.6",
     " .edge.off": "stroke-dasharray:4 4",
-    " .edge.back": "stroke:@accent;stroke-dasharray:6 3",
-    " .tip.back": "fill:@accent",
     " .changed .dot": "fill:@warn",
     " .frame": "fill:none;stroke:@line",
     " .mark": "fill:none;stroke:@line;stroke-width:1.4",

@@ -23,7 +23,8 @@ from epypes.display.views.groups import function_count
 from epypes.wording import counted
 
 _OFF: Final = " off"
-_BACK: Final = " back"
+# Here, not in the style, which every picture has.
+_BACK: Final = ' back" stroke-dasharray="6 3'
 
 
 @lru_cache(maxsize=128)
