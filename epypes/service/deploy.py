@@ -42,6 +42,8 @@ class Deployer:
         How long an event may take: the switch waits for it.
     notify_listeners
         Called with ``"deployed"`` and what is served now.
+    why_refused
+        Returns why a bundle can't be served with the options of the service; empty if it can.
     """
 
     def __init__(
@@ -51,8 +53,9 @@ class Deployer:
         parameters: ParameterControl,
         job_timeout_s: float,
         notify_listeners: Callable[[str, dict[str, Any]], None],
+        why_refused: Callable[[BundleInfo], str],
     ) -> None:
-        self._notify_listeners = notify_listeners
+        self._notify_listeners, self._why_refused = notify_listeners, why_refused
         self._dispatcher, self._supervisor, self._parameters = dispatcher, supervisor, parameters
         self._timeout_s = job_timeout_s + _GRACE_S
         self._lock = threading.Lock()
@@ -162,7 +165,7 @@ class Deployer:
 
     def _deploy(self, bundle: BundleInfo, how: str, state: StateChoice | None) -> list[str]:
         now = self._supervisor.bundle
-        reasons = differing_ports(now.settings, bundle.settings)
+        reasons = [*differing_ports(now.settings, bundle.settings), *filter(None, [self._why_refused(bundle)])]
         if reasons:
             raise DeployRefused(bundle.path, reasons)
         try:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 StatePer = Literal["one", "source"]
 # What a deploy does with the states.
 StateChoice = Literal["keep", "reset"]
-# By key of the state: what two bundles must have in common so that one goes on with the state of the other.
-Delays = Mapping[str, Any]
+# By key of the state, what two bundles must have in common so that one goes on with the state of the other: the delayed
+# token, and a digest of the initial value.
+Delays = Mapping[str, Sequence[str]]
 
 MAX_SOURCES: Final = 1_000
 MAX_BYTES: Final = 512 * 1024**2
@@ -201,28 +202,27 @@ def change_of_state(before: Delays, after: Delays, choice: StateChoice | None) -
         is_kept = choice != "reset"
         return is_kept, (f"state between events {'kept' if is_kept else 'reset'}" if before else "")
     had, has = (
-        ", ".join(f"{key} of {each[0]}" if each[0] else key for key, each in sorted(of.items())) or "none"
-        for of in (before, after)
+        ", ".join(f"{key} of {each[0]}" for key, each in sorted(of.items())) or "none" for of in (before, after)
     )
     how = f"{had} -> {has}" if had != has else f"{had} begins with another value"
     return False, f"state between events reset: {how}"
 
 
-def why_refused(delays: Delays, options: Options, others: Iterable[str]) -> str:
+def why_refused(states: Mapping[str, str], options: Options, others: Iterable[str] = ()) -> str:
     """Return why a bundle with state between events can't be served so; empty if it can.
 
     Parameters
     ----------
-    delays
-        Of the bundle; empty if it has no state.
+    states
+        Of the bundle, as ``Settings.states``; empty if it has no state.
     options
         Of the service.
     others
         Names of the replicas that take events from the same queue.
     """
-    if not delays:
+    if not states:
         return ""
-    has_state = f"The bundle has state between events ({', '.join(map(repr, delays))})"
+    has_state = f"The bundle has state between events ({', '.join(map(repr, states))})"
     if options.threads > 1 and options.state_per == "one":
         text = f"{has_state}, and on {counted(options.threads, 'thread')} its events have no order. Serve it with"
         return f"{text} --threads 1, or with a state for each source of events: --state-per source."

@@ -11,7 +11,8 @@ from pathlib import Path
 from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from epypes.service.bundle_info import read_bundle_info
+from epypes.errors import ServiceError
+from epypes.service.bundle_info import BundleInfo, read_bundle_info
 from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import AnswerOutput, Endpoints, EventInput, group_address
@@ -31,8 +32,6 @@ from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack
-    from epypes.service.worker_connection import WorkerConnection
-
 # The share of a drain's time for working on accepted events; the rest is for reporting others, and for closing.
 _DRAIN_SHARE: Final = 0.7
 _CHANGE_TIMEOUT_S: Final = 10.0
@@ -63,13 +62,16 @@ class Service:
     AddressError
         An address is not on loopback.
     ServiceError, StoreError
-        The mailbox, a time-out or the number of threads is invalid; or the database can't be used.
+        The mailbox, a time-out or the number of threads is invalid, or the bundle has state between events, which these
+        options would mix up; or the database can't be used.
     """
 
     def __init__(self, path: str | Path, sub: str = ANY_PORT, pub: str = ANY_PORT, **options: Any) -> None:
         self.options = given = Options(sub, pub, **options)
         given.check(path)
         bundle = read_bundle_info(path)
+        if reason := why_refused(bundle.settings.states, given):
+            raise ServiceError(bundle.path, reason)
         self.path, self.threads = bundle.path, given.threads
         self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
         self.http = self.token_file = ""
@@ -85,17 +87,16 @@ class Service:
         self._parameters = ParameterControl(bundle, self._dispatcher, self._results.notify, change_timeout_s)
         self._lifecycle = Lifecycle(self._dispatcher, self._endpoints, self._results, lambda: self._supervisor.health)
         self._supervisor = Supervisor(
-            self._dispatcher,
-            bundle,
-            given.threads,
-            given.job_timeout_s,
-            self._parameters,
-            self._lifecycle.check,
-            self._why_refused,
+            self._dispatcher, bundle, given.threads, given.job_timeout_s, self._parameters, self._lifecycle.check
         )
         self._queries = WorkerQueries(lambda: self._supervisor.bundle, lambda: self._dispatcher.connection)
         self._deployer = Deployer(
-            self._dispatcher, self._supervisor, self._parameters, given.job_timeout_s, self._results.notify
+            self._dispatcher,
+            self._supervisor,
+            self._parameters,
+            given.job_timeout_s,
+            self._results.notify,
+            self._why_refused,
         )
         self._replicas = Replicas(
             group_address(given),
@@ -300,16 +301,15 @@ class Service:
         bundle, current = self._supervisor.bundle, self._parameters.current
         return Provenance(bundle.settings.name, str(bundle.path), bundle.digest, current.revision, current.entries)
 
-    def _why_refused(self, worker: WorkerConnection) -> str:
-        """Return why a worker's bundle can't be served with these options; empty if it can."""
-        return why_refused(worker.about.get("delays", {}), self.options, self._replicas.others())
+    def _why_refused(self, bundle: BundleInfo) -> str:
+        """Return why a bundle can't be served with these options, and beside these replicas; empty if it can."""
+        return why_refused(bundle.settings.states, self.options, self._replicas.others())
 
     def _joined(self) -> None:
         """Work on events, now that the other replicas are known; unless the bundle can't be served beside them."""
         with self._dispatcher.lock:
-            worker = self._dispatcher.connection
-            if worker is not None and (reason := self._why_refused(worker)):
-                self._supervisor.refuse(worker, reason)
+            if reason := self._why_refused(self._supervisor.bundle):
+                self._supervisor.refuse(reason)
         self._dispatcher.release(_JOINING)
         self._dispatcher.publish()
 
@@ -388,7 +388,7 @@ class Service:
         ServiceError
             The bundle has no state between events; or all sources have one.
         """
-        if not self._dispatcher.describe_states():
+        if not self._supervisor.bundle.settings.states:
             text = "There is nothing to reset: no bundle with state between events (ep.delay) is served."
             raise ServiceError(self._supervisor.bundle.path, text)
         count = self._dispatcher.reset_state(source)

@@ -45,8 +45,6 @@ class Supervisor:
         What a new worker computes with.
     on_change
         Called, with the lock held, when the state of the service may have changed.
-    why_refused
-        Returns why the bundle of a worker that is ready can't be served with the options of the service; or nothing.
 
     Attributes
     ----------
@@ -66,14 +64,13 @@ class Supervisor:
         job_timeout_s: float,
         parameters: ParameterControl,
         on_change: Callable[[], None],
-        why_refused: Callable[[WorkerConnection], str],
     ) -> None:
         self.bundle, self.health = bundle, WorkerHealth()
         self.is_rewritten = False
         self.worker: WorkerConnection | None = None
         self._dispatcher, self._threads = dispatcher, threads
         self._timeout_s = job_timeout_s
-        self._parameters, self._on_change, self._why_refused = parameters, on_change, why_refused
+        self._parameters, self._on_change = parameters, on_change
         self._changed = dispatcher.changed
         self._to_start: deque[tuple[BundleInfo, list[WorkerConnection | Exception]]] = deque()
         self._restart_s: float | None = None
@@ -210,20 +207,12 @@ class Supervisor:
             connection.kill()
             self._fault(f"{self.bundle.path} is not the bundle any more that is served. Deploy it, or restore it.")
             return
-        if reason := self._why_refused(connection):
-            self.refuse(connection, reason)
-            return
         parameters = self._parameters.for_new_worker()
         if parameters is None:
             self._use(connection)
         else:
             # It gets events once it has confirmed them.
             connection.post_parameters(*parameters)
-
-    def refuse(self, connection: WorkerConnection, reason: str) -> None:
-        """End a worker whose bundle can't be served with the options of the service. With the lock held."""
-        connection.kill()
-        self._fault(reason)
 
     def _dismiss_for_another(self, connection: WorkerConnection) -> None:
         """End a worker of what is not served any more; start another if there is none. With the lock held."""
@@ -298,6 +287,12 @@ class Supervisor:
         self._changed.notify_all()
         self._on_change()
 
+    def refuse(self, why: str) -> None:
+        """End the worker, and start none any more: the bundle can't be served any longer. With the lock held."""
+        if self.worker is not None:
+            self.worker.kill()
+        self._fault(why)
+
     def _fault(self, why: str) -> None:
         """Start no worker any more: what is wrong does not pass by itself. With the lock held."""
         if self._is_ending:
@@ -350,14 +345,10 @@ class Supervisor:
             is_over = self._changed.wait_for(
                 lambda: connection.status != "loading" or self._is_ending, REPLAY_TIMEOUT_S
             )
-        is_whole = connection.status == "ready" and connection.about.get("digest") == bundle.digest
-        refusal = self._why_refused(connection) if is_whole else ""
-        if is_whole and not refusal:
+        if connection.status == "ready" and connection.about.get("digest") == bundle.digest:
             return connection
         connection.kill()
-        if refusal:
-            why = refusal
-        elif connection.status == "ready":
+        if connection.status == "ready":
             why = "it was changed while it was loaded. Deploy it again."
         elif connection.status == "refused":
             why = " ".join(connection.reasons)

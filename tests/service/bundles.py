@@ -14,7 +14,7 @@ def toml(value):
     return repr(value) if not isinstance(value, str) else f'"{value}"'
 
 
-def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sample, own=()):
+def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sample, own=(), states=()):
     """Write a bundle whose module is this source; ``sample`` is the inputs and outputs of one run."""
     (folder / "samples").mkdir(parents=True)
     (folder / "pipeline.py").write_text(textwrap.dedent(source))
@@ -28,6 +28,8 @@ def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sampl
     ]
     if own:
         settings.append(f"own = {list(own)!r}".replace("'", '"'))
+    if states:
+        settings += ["[states]", *(f'"{key}" = "{token}"' for key, token in dict(states).items())]
     for token, value in dict(hyperparameters).items():
         settings += [f"[hyperparameters.{token}]", f"value = {toml(value)}"]
     (folder / "pipeline.toml").write_text("\n".join(settings) + "\n")

@@ -45,11 +45,12 @@ SOURCE = '''
         return Envelope("answer", {"out": view["out"]}, correlation_id=view.event.id)
 
 
-    sums = ep.delay(
-        ep.CompGraph({"add": add}, {"add": (("what", "number", "before"), "total")}), "total", "before", INITIAL
-    )
-    func_dict = {"sum": ep.Pipeline("sum", sums), "check": check}
-    func_io = {"sum": (("what", "number"), "total"), "check": (("what", "total", "k"), "out")}
+    def with_delays(cg):
+        return ep.delay(cg, "total", "before", initial=INITIAL)
+
+
+    func_dict = {"add": add, "check": check}
+    func_io = {"add": (("what", "number", "before"), "total"), "check": (("what", "total", "k"), "out")}
 '''
 
 
@@ -63,6 +64,7 @@ def stateful_bundle(folder, *, k=1, initial=0, source=SOURCE):
         hyperparameters={"k": k},
         sample=({"what": "plain", "number": 3}, {"out": (3 + initial) * k}),
         own=("f_out",),
+        states={"before": "total"},
     )
 
 

@@ -202,11 +202,8 @@ class FailureStore:
         except EpypesError as error:
             return None, str(error)
         if len(packed) > most:
-            with_state = " with its state" if state else ""
-            return (
-                None,
-                f"it has {len(packed) / 1e6:,.1f} MB{with_state}, more than the {most / 1e6:,.1f} MB of one event",
-            )
+            size = f"{len(packed) / 1e6:,.1f} MB{' with its state' if state else ''}"
+            return None, f"it has {size}, more than the {most / 1e6:,.1f} MB of one event"
         return packed, ""
 
     def _put(self, record: FailedEvent, packed: bytes) -> None:

@@ -62,7 +62,7 @@ class Worker:
     Attributes
     ----------
     delays
-        What the graph keeps between events; see `describe_delays`.
+        What the bundle keeps between events; see `describe_delays`.
     """
 
     def __init__(self, front: FrameSocket, control: ControlSocket, bundle: Bundle, threads: int) -> None:
@@ -74,7 +74,7 @@ class Worker:
         states = WorkerStates()
         self._slots = [Slot(bundle, inputs, front, parameters, answers, states) for _ in range(threads)]
         parameters.pipelines = [slot.pipeline for slot in self._slots]
-        self.delays = describe_delays(self._slots[0].pipeline)
+        self.delays = describe_delays(self._slots[0].pipeline, bundle.settings.states)
 
     def work(self) -> None:
         """Work until the front sends that nothing more comes; the process ends if the front is gone."""

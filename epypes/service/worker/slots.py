@@ -57,7 +57,7 @@ class Slot:
     answers
         Gets each run that has completed.
     states
-        What the events before have left, if the graph has state between events.
+        What the events before have left, if the bundle has state between events.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Slot:
             Failure("handle", (), {}, error, getattr(event, "id", ""))
         )
         self._is_last_put = _puts_last(self.pipeline)
-        self._states = states if self.pipeline.state else None
+        self._states = states if bundle.settings.states else None
         # What the pipeline has taken over from `_states` last; None for the initial state.
         self._state: object = None
 

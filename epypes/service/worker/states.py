@@ -15,7 +15,6 @@ from epypes.errors import MessageError
 from epypes.service.packing import BytesLike, pack_state, unpack_state
 
 if TYPE_CHECKING:
-    from epypes.graph import CompGraph
     from epypes.pipeline import Pipeline
     from epypes.service.frame_socket import WorkerMessage
 
@@ -24,21 +23,17 @@ State = Mapping[str, Any] | None
 _DIGEST_CHARACTERS: Final = 16
 
 
-def describe_delays(pipeline: Pipeline) -> dict[str, list[str]]:
-    """Return, by key of the state, the token that is delayed and a digest of the initial value; empty without state.
+def describe_delays(pipeline: Pipeline, states: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return, by key of the state, the token that is delayed and a digest of the initial value.
 
-    Called before the first event.
+    Parameters
+    ----------
+    pipeline
+        Before its first event.
+    states
+        Of its bundle, as ``Settings.states``.
     """
-    return {key: [_delayed(pipeline.cg, key), _digest(key, value)] for key, value in pipeline.state.items()}
-
-
-def _delayed(cg: CompGraph, key: str) -> str:
-    """Return the token that is delayed under a key, which begins with the names of nested pipelines."""
-    if key in cg.delays:
-        return cg.delays[key].token
-    name, function = next((each for each in cg.functions.items() if key.startswith(f"{each[0]}.")), ("", None))
-    inner = getattr(function, "cg", None)
-    return "" if inner is None else f"{name}.{_delayed(inner, key.removeprefix(f'{name}.'))}"
+    return {key: [token, _digest(key, pipeline.state[key])] for key, token in states.items()}
 
 
 def _digest(key: str, value: Any) -> str:
