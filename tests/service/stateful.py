@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from tests.service.bundles import written_bundle
-from tests.service.served import TIMEOUT_S, event
+from tests.service.served import event
 
 SOURCE = '''
     """A graph that adds the numbers of its events."""
@@ -24,8 +26,14 @@ SOURCE = '''
         if what == "kill":
             os.kill(os.getpid(), 9)
             time.sleep(1000)
-        if what == "set":
+        if what == "object":
             return object()
+        name, _, path = what.partition(":")
+        if name == "touch":
+            open(path, "w").close()
+        if name in ("touch", "wait"):
+            while not os.path.exists(path):
+                time.sleep(0.002)
         return before + number
 
 
@@ -34,15 +42,9 @@ SOURCE = '''
             raise ValueError("after the sum")
         if what == "hold":
             time.sleep(1000)
-        return 0 if what == "set" else total * k
-
-
-    def f_out(view):
-        from epypes.wire import Envelope
-
-        if view["what"] == "fail answer":
-            raise ValueError("in the answer")
-        return Envelope("answer", {"out": view["out"]}, correlation_id=view.event.id)
+        if what == "fail answer":
+            return object()
+        return 0 if what == "object" else total * k
 
 
     def with_delays(cg):
@@ -63,18 +65,21 @@ def stateful_bundle(folder, *, k=1, initial=0, source=SOURCE):
         ("out",),
         hyperparameters={"k": k},
         sample=({"what": "plain", "number": 3}, {"out": (3 + initial) * k}),
-        own=("f_out",),
         states={"before": "total"},
     )
 
 
-def ask_from(peer, source, number=1, what="plain"):
-    """Send an event of a source, and return its answer."""
-    from dataclasses import replace
+def send_from(peer, source, number=1, what="plain"):
+    """Send an event of a source."""
+    peer.requests.put(replace(event(what, number), source=source))
 
-    request = replace(event(what, number), source=source)
-    peer.requests.put(request)
-    while True:
-        (answer,) = peer.take(timeout_s=TIMEOUT_S)
-        if answer.correlation_id == request.id:
-            return answer
+
+def sums(peer, *numbers, source=""):
+    """Send events one after the other, and return what they are answered with."""
+    found = []
+    for number in numbers:
+        send_from(peer, source, number)
+        (answer,) = peer.take()
+        assert answer.failure is None, answer.failure
+        found.append(answer.parts["out"])
+    return found
