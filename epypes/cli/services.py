@@ -282,8 +282,19 @@ def reset(source: str, event_source: str | None, token_file: Path | None, replic
     The next event begins with the initial values of the delays, as the first one did. Stopping a service resets its
     state too; a worker that dies does not.
     """
-    with connect_to(source, token_file, replica) as service:
-        service.reset(event_source)
+    # Of several replicas each has the states of the sources whose events it gets.
+    urls = [] if is_url(source) else [state.http for state in states_of(source, replica) if state.http]
+    refusals = []
+    for url in urls or [source]:
+        try:
+            with connect_to(url, token_file, replica) as service:
+                service.reset(event_source)
+        except ServiceError as error:
+            refusals.append(error)
+    if len(refusals) == max(len(urls), 1):
+        raise refusals[0]
+    for refusal in refusals:
+        click.echo(f"{refusal}", err=True)
     of = "" if event_source is None else f" of source {event_source}"
     click.echo(f"RESET the state between events{of}.")
 

@@ -50,7 +50,7 @@ class Series:
     block
         What the last answered event has left, encoded; empty for the initial state.
     holder
-        The worker that has it.
+        The worker that has it; None if the next event brings it.
     last_seq
         Of the last event that was begun.
     """
@@ -123,19 +123,25 @@ class EventStates:
                 del self._dropped[each]
         series.holder = None
         connection.post_event(event.seq, frames, content)
+        # It has answered before the next event of the series is posted.
         series.holder = connection
 
     def note(self, event: AcceptedEvent, message: WorkerMessage, running: Iterable[AcceptedEvent]) -> None:
         """Keep what an event has left by a worker's ``done`` message; a failed one leaves the state as it was."""
         key = self.key_of(event)
         series = self._series.get(key)
-        # It is another one if the state was reset while the event was in flight.
-        if series is not None and series is event.series and message.content.get("has_state"):
-            self._bytes -= len(series.block)
-            # A copy: a small frame is a part of the memory of its whole message.
-            series.block = bytes(message.frames[-1])
-            self._bytes += len(series.block)
-            self._make_room(running)
+        if series is None or series is not event.series:
+            # The state was reset while the event was in flight.
+            return
+        if not message.content.get("has_state"):
+            # It is sent again: the worker may have no memory for it.
+            series.holder = None
+            return
+        self._bytes -= len(series.block)
+        # A copy: a small frame is a part of the memory of its whole message.
+        series.block = bytes(message.frames[-1])
+        self._bytes += len(series.block)
+        self._make_room(running)
 
     def _make_room(self, running: Iterable[AcceptedEvent]) -> None:
         """Forget the states of sources that have been idle for the longest time, if there are too many."""

@@ -50,7 +50,7 @@ _RETRY_S: Final = 0.25
 _CLOSE_S: Final = 1.0
 _MAX_BUNDLES: Final = 100
 # In these states a replica takes no events.
-_TAKES_NONE: Final = ("FAULTED", "STOPPED")
+_TAKES_NONE: Final = ("DRAINING", "FAULTED", "STOPPED")
 # Longer texts are cut: a heartbeat is small.
 _MAX_TEXT: Final = 500
 

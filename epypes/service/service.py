@@ -32,6 +32,7 @@ from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack
+
 # The share of a drain's time for working on accepted events; the rest is for reporting others, and for closing.
 _DRAIN_SHARE: Final = 0.7
 _CHANGE_TIMEOUT_S: Final = 10.0
@@ -98,12 +99,7 @@ class Service:
             self._results.notify,
             self._why_refused,
         )
-        self._replicas = Replicas(
-            group_address(given),
-            self._facts,
-            self._parameters,
-            self._joined,
-        )
+        self._replicas = Replicas(group_address(given), self._facts, self._parameters, self._joined)
         self._parameters.newest = self._replicas.newest
         self._started_ns = 0
         self._lock = threading.Lock()

@@ -216,20 +216,20 @@ class Slot:
 
     def _leave_state(self, states: WorkerStates, work: _Work) -> list[bytes]:
         """Keep what an event has left for the next one, and return it encoded; nothing if the event failed."""
-        state, after = work.state, list[bytes]()
-        if work.failure is None:
-            try:
-                state = self.pipeline.state
-                after = [pack_state(state)]
-            except MessageError as error:
-                state = work.state
-                work.answers.clear()
-                work.failure = Failure("state", tuple(self.pipeline.state), {}, error, work.event_id)
-        # After a failure the pipeline is wherever its functions, or f_out, have left it.
-        self._state = state if work.failure is None else _UNKNOWN
-        if work.message is not None:
-            states.keep(work.message, state)
-        return after
+        # The graph may have gone on before f_out failed: the pipeline takes the state over anew then.
+        self._state = _UNKNOWN
+        if work.failure is not None or work.message is None:
+            return []
+        state = self.pipeline.state
+        try:
+            block = pack_state(state)
+        except MessageError as error:
+            work.answers.clear()
+            work.failure = Failure("state", tuple(state), {}, error, work.event_id)
+            return []
+        states.keep(work.message, state)
+        self._state = state
+        return [block]
 
 
 @dataclass(slots=True, eq=False)

@@ -50,25 +50,25 @@ class WorkerStates:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        # By key: the number of the last event, and the state that it begins with or has left.
+        # By key: the number of the last event that was answered, and the state that it has left.
         self._kept: dict[str, tuple[int, State]] = {}
 
     def begin(self, message: WorkerMessage) -> tuple[State, Sequence[BytesLike]]:
         """Return the state that an event begins with, and the frames of the event."""
-        seq, key, where, frames = message.number, message.content["key"], message.content["state"], message.frames
-        given: State = None
+        where, frames = message.content["state"], message.frames
+        state: State = None
         if where == "given":
             *frames, block = frames
-            given = unpack_state(block)
+            state = unpack_state(block)
         with self._lock:
             for other, last_seq in message.content.get("forget", {}).items():
                 if other in self._kept and self._kept[other][0] <= last_seq:
                     del self._kept[other]
-            state = self._kept[key][1] if where == "held" else given
-            self._kept[key] = seq, state
+            if where == "held":
+                state = self._kept[message.content["key"]][1]
         return state, frames
 
     def keep(self, message: WorkerMessage, state: State) -> None:
-        """Keep what an event has left; after a failed one, what it began with."""
+        """Keep what an event has left. After one that fails the front gives the state again."""
         with self._lock:
             self._kept[message.content["key"]] = message.number, state
