@@ -70,6 +70,7 @@ $(VENV)/.test: pyproject.toml | $(BIN)/python
 
 $(VENV)/.bench: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[all]' --group test --group bench
+	$(PIP) --target $(VENV)/published --no-deps epypes==0.1.1
 	touch $@ $(VENV)/.test $(VENV)/.all
 
 .PHONY: chromium postgres brokers

@@ -32,7 +32,7 @@ from epypes.bundle.settings import read_settings
 from epypes.bundle.side_effects import place_of_change
 from epypes.errors import BundleError, PromotionRefused
 from epypes.optional import optional_import
-from epypes.wire.samples import load_sample, save_sample
+from epypes.wire.samples import read_sample, save_sample
 
 # As many as a replay of the usual and one of the other conditions.
 _PROCESSES: Final = 2
@@ -305,6 +305,6 @@ def _tolerate(draft: Path, noise: Sequence[Difference]) -> None:
     (draft / SETTINGS).write_text(tomlkit.dumps(document), encoding="utf-8")
     rgb = read_settings(draft / SETTINGS).rgb
     for path in (draft / SAMPLES).glob("*.npz"):
-        inputs, outputs = load_sample(path)
-        if outputs.pop(ANSWER, None) is not None:
-            save_sample(path, inputs, outputs, rgb=rgb)
+        sample = read_sample(path)
+        if sample.outputs.pop(ANSWER, None) is not None:
+            save_sample(path, **sample._asdict(), rgb=rgb)

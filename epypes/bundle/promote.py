@@ -19,16 +19,19 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.arrays import store_hyperparameters
 from epypes.bundle.clone import clone_runner, parameters_of
+from epypes.bundle.compare import differences
 from epypes.bundle.determinism import prove
 from epypes.bundle.load import MAKER, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, MODULE, SAMPLES, SETTINGS, why_no_bundle
 from epypes.bundle.module import PIPELINES, write_module
+from epypes.bundle.objects import describe_message
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import MOST_NUMBERS, Settings, states_of, unwritable, writable_defaults, write_settings
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
@@ -43,6 +46,9 @@ _AT_FDCWD: Final = -100
 _RENAME_EXCHANGE: Final = 2
 # What the names of folders end with in which drafts are.
 _DRAFTS: Final = ".epypes-draft"
+_NO_FIRST: Final = (
+    "Have the functions take it, or begin with a value that they take: ep.delay(cg, token, previous, initial=...)."
+)
 _MEDIA_TYPE: Final = "application/vnd.epypes.promotion+json"
 
 
@@ -65,7 +71,7 @@ def promote(
     Parameters
     ----------
     runner_or_pipeline
-        Its last run becomes the recorded sample.
+        Its last run becomes the recorded sample, with the state that it began with if the graph has delays.
     to
         The folder; a bundle that is there is replaced, if all its files are its own; anything else is not.
     outputs
@@ -75,7 +81,7 @@ def promote(
         without. Otherwise it takes and gives Envelopes with one part per token. Events may be Envelopes or bytes.
     samples
         Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
-        or mappings by token.
+        or mappings by token. If the graph has delays, they are a sequence that goes on from the last run.
     on_progress
         Called with what is being done, and with what the replays found that is worth knowing.
 
@@ -177,16 +183,37 @@ def _write(
 
 
 def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:
-    """Give the last run, then runs of further payloads."""
-    if runner.last is not None:  # as _unready has made sure
-        yield runner.last
+    """Give the last run, then runs of further payloads; each goes on from the state that the one before has left.
+
+    A service begins with the initial state: if no run began with that, one of the last payload does so in the end.
+    """
+    if runner.last is None:
+        return  # as _unready has made sure, there is one
+    last = run = runner.last
+    initial = dict(clone_runner(runner).state)
+    has_first = not any(differences(initial, dict(run.state_before)))
+    yield run
     for number, sample in enumerate(samples, 1):
         payload = sample if isinstance(sample, Mapping) else dict.fromkeys(runner.free_source_tokens[:1], sample)
-        try:
-            run = clone_runner(runner).run_on(payload)
-        except Exception as error:  # whatever a function raises on it
-            raise Refused(f"Sample {number} can't be run: {type(error).__name__}: {error}") from error
+        run = _run_from(runner, payload, run.state, f"Sample {number} can't be run")
+        has_first = has_first or not any(differences(initial, dict(run.state_before)))
         yield run
+    if not has_first:
+        payload = {token: last[token] for token in runner.free_source_tokens}
+        text = "A service begins with the initial state, and the last payload can't be run with it"
+        yield _run_from(runner, payload, initial, text, f" {_NO_FIRST}")
+
+
+def _run_from(
+    runner: CompGraphRunner, payload: Mapping[str, Any], state: Mapping[str, Any], failure: str, way_out: str = ""
+) -> Run:
+    """Run a payload on a clone of a runner, from a state; a failure is refused in these words."""
+    clone = clone_runner(runner)
+    clone.state = state
+    try:
+        return clone.run_on(payload)
+    except Exception as error:  # whatever a function raises on it
+        raise Refused(f"{failure}: {type(error).__name__}: {error}{'.' * bool(way_out)}{way_out}") from error
 
 
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
@@ -207,13 +234,21 @@ def _record(path: Path, run: Run, settings: Settings, f_out: Callable[..., Any] 
     """Record a run as a sample, with the answer that the user's own f_out makes of it."""
     from epypes.wire.samples import save_sample
 
+    for key, token in settings.states.items():
+        for value in (run.state_before[key], run.state[key]):
+            try:
+                describe_message(value)
+            except MessageError as error:
+                text = f"State {key!r}, which token {token!r} leaves for the next run, can't be recorded: its {error}"
+                raise Refused(text) from error
     inputs, outputs = ({token: run[token] for token in side} for side in (settings.inputs, settings.outputs))
+    save = partial(save_sample, path, inputs, rgb=settings.rgb, state=run.state_before, state_after=run.state)
     answer = answer_of(f_out, settings.name, run, settings.attributes) if f_out is not None else None
     if answer is not None:
         # An answer without a codec can't be sent either.
         with contextlib.suppress(MessageError):
-            return save_sample(path, inputs, {**outputs, ANSWER: answer}, rgb=settings.rgb)
-    return save_sample(path, inputs, outputs, rgb=settings.rgb)
+            return save({**outputs, ANSWER: answer})
+    return save(outputs)
 
 
 def _replace(draft: Path, target: Path) -> None:

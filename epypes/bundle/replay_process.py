@@ -39,7 +39,7 @@ from epypes.bundle.replay import ReplayReport, record_again, replay
 from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.run.guard import as_written
-from epypes.wire.samples import load_sample
+from epypes.wire.samples import read_sample
 
 REPLAY_TIMEOUT_S: Final = 600.0
 _MOST_NAMED: Final = 8
@@ -155,7 +155,7 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
     for path in sorted((folder / SAMPLES).glob("*.npz")):
         # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
         with contextlib.suppress(EpypesError):
-            sample = load_sample(path)
+            sample = read_sample(path)
             list(differences(sample, sample))
     before = frozenset(sys.modules)
     access, ran = FileAccess(folder), trace_lines(folder / MODULE)

@@ -97,6 +97,13 @@ class Run(TokenMapping):
         known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
         return MappingProxyType({key: lend(value) if guard else value for key, value in known.items()})
 
+    @property
+    def state_before(self) -> Mapping[str, Any]:
+        """What the run began with, by delayed token; ``runner.trial`` takes it to repeat the run on its payload."""
+        values, program = self.record[0], self.record[4].program
+        known = {slots.key: values[slots.before] for slots in program.states}
+        return MappingProxyType({key: lend(value) if program.guard else value for key, value in known.items()})
+
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
         values, *_, failure = self.record

@@ -14,7 +14,8 @@ import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from epypes.errors import MessageError
 from epypes.optional import optional_import
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 _DESCRIPTION = "description"
-_SIDES = ("inputs", "outputs")
+# The last two are there only where a graph has state between runs.
+_SIDES = ("inputs", "outputs", "state", "state_after")
 # A zip entry carries a time; a fixed one makes the file depend on its values alone.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 # A sample is the user's own file, not a peer's message: it may hold any number of arrays and keys.
@@ -38,8 +40,31 @@ _LIMITS = Limits(frames=2**31, parts=2**31, keys=2**31)
 _BROKEN = (OSError, ValueError, TypeError, LookupError, EOFError, AttributeError, MemoryError, RuntimeError)
 
 
+class Sample(NamedTuple):
+    """The values of one run.
+
+    Attributes
+    ----------
+    inputs, outputs
+        Values by token.
+    state, state_after
+        What the run began with and what it left, by key of ``runner.state``; empty of a graph without delays.
+    """
+
+    inputs: dict[str, Any]
+    outputs: dict[str, Any]
+    state: dict[str, Any]
+    state_after: dict[str, Any]
+
+
 def save_sample(
-    path: str | Path, inputs: Mapping[str, Any], outputs: Mapping[str, Any], *, rgb: Collection[str] = ()
+    path: str | Path,
+    inputs: Mapping[str, Any],
+    outputs: Mapping[str, Any],
+    *,
+    rgb: Collection[str] = (),
+    state: Mapping[str, Any] = MappingProxyType({}),
+    state_after: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write the values of one run to an .npz file.
 
@@ -51,6 +76,8 @@ def save_sample(
         Values by token name, of the types that `epypes.wire.encode` takes.
     rgb
         Names of the tokens whose images are in RGB order; those of all others are BGR.
+    state, state_after
+        What the run began with and what it left, by key of ``runner.state``.
 
     Raises
     ------
@@ -67,7 +94,9 @@ def save_sample(
     writer = ValueWriter(_LIMITS, inline_below=0)
     arrays: dict[str, AnyArray] = {}
     described: dict[str, Any] = {"format": FORMAT}
-    for side, values in zip(_SIDES, (inputs, outputs), strict=True):
+    for side, values in zip(_SIDES, (inputs, outputs, state, state_after), strict=True):
+        if side not in _SIDES[:2] and not values:
+            continue
         described[side] = []
         for name, value in values.items():
             message = message_class("epypes.v1.Value")()
@@ -110,6 +139,18 @@ def load_sample(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises
     ------
     MessageError
+        As `read_sample` does.
+    """
+    sample = read_sample(path)
+    return sample.inputs, sample.outputs
+
+
+def read_sample(path: str | Path) -> Sample:
+    """Return the values of a file that `save_sample` wrote, with the state; arrays are read-only.
+
+    Raises
+    ------
+    MessageError
         Of reason ``"bad sample"`` if the file is missing, broken or no sample; no pickle is ever read.
     """
     try:
@@ -120,11 +161,12 @@ def load_sample(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
                 raise ValueError(f"its format is {described['format']!r}, and this version reads {FORMAT}")
             views = [flat_bytes(_read_entry(archive, name)) for name in described["arrays"]]
         reader = ValueReader(views, _LIMITS)
-        inputs, outputs = (reader.read_named([*_parts(described[side])], side)[0] for side in _SIDES)
+        sides = {**dict.fromkeys(_SIDES[2:], ()), **described}
+        sample = Sample(*(reader.read_named([*_parts(sides[side])], side)[0] for side in _SIDES))
         reader.check_all_used()
     except (MessageError, zipfile.BadZipFile, zlib.error, *_BROKEN) as error:
         raise MessageError("bad sample", f"{path} is no sample of EPypes: {error}") from error
-    return inputs, outputs
+    return sample
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> AnyArray:

@@ -12,16 +12,21 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.bundle import verify
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
 from epypes.bundle.settings import read_settings
-from epypes.errors import BundleError, PromotionRefused
+from epypes.bundle.writeback import write_back
+from epypes.errors import BundleError, PromotionRefused, ReplayDiffers
 from epypes.wire import Envelope
+from epypes.wire.samples import read_sample, save_sample
 from tests.bundle.cells import cell
 
 pytestmark = pytest.mark.slow  # each proves a bundle in a process of its own
 
 CELL = """\
+import random
+
 import cv2
 import numpy as np
 
@@ -40,6 +45,47 @@ def scale(value, by):
 
 def add(image, total):
     return image + total
+
+
+def drift(x, before):
+    return before + random.random() * x
+
+
+def letters(x, seen):
+    return " ".join({"canny", "sobel", "scharr", "prewitt", "laplace", x, *(seen or "").split()})
+
+
+def parts(x, before):
+    split = np.array_split(np.sin(np.arange(10_000.0)) * x, cv2.getNumThreads() + 1)
+    return before + sum(np.cumsum(part)[-1] for part in split)
+
+
+def appended(x, known):
+    found = dict(known or {"points": []})
+    found["points"].append(x)
+    return found
+
+
+def tracked(x, known):
+    points = known["points"] if known else []
+    return {"points": [*points, cv2.KeyPoint(x, 1.0, 2.0)], "sizes": np.array([np.nan, x]), "ago": float("nan")}
+
+
+class Model:
+    def __init__(self, x):
+        self.x = x
+
+
+def learnt(x, model):
+    return Model(x)
+
+
+def of_model(model):
+    return model.x
+
+
+def negated(x):
+    return -x
 """
 
 
@@ -73,9 +119,7 @@ class Promoted:
         self.runner = ep.CompGraphRunner(adding(names))
         self.images = [np.full((20, 50), float(number)) for number in range(4)]
         self.series = [self.runner.run(image=image)["y"] for image in self.images]
-        self.runner.reset()
-        self.runner.run(image=self.images[0])
-        self.bundle = ep.promote(self.runner, folder)
+        self.bundle = ep.promote(self.runner, folder, samples=self.images[:2])
 
 
 @pytest.fixture(scope="module")
@@ -148,11 +192,158 @@ def test_states_that_module_and_settings_name_otherwise_are_refused(promoted, tm
         read_bundle(folder)
 
 
-def test_an_initial_value_that_no_expression_makes_is_refused_with_the_way_out(names, tmp_path):
-    cg = ep.delay(ep.CompGraph({"scale": names["scale"]}, {"scale": (("x", "model"), "y")}), "y", "model", object())
-    runner = ep.CompGraphRunner(cg)
-    runner.state = {"model": 2}
-    runner.run(x=1)
-    with pytest.raises(PromotionRefused, match="initial value of 'model' is of type object.*get") as refused:
-        ep.promote(runner, tmp_path / "model")
-    assert 'ep.delay(cg, "y", "model", initial=None)' in str(refused.value)
+@pytest.fixture
+def copied(promoted, tmp_path):
+    """A copy of the bundle that a test may spoil."""
+    return shutil.copytree(promoted.bundle.path, tmp_path / "adding")
+
+
+def delayed(function, outputs=("made", "y"), previous="before", initial=None, reader=len):
+    """Return a graph of a function of x and its own value before, which another function reads."""
+    made, y = outputs
+    cg = ep.CompGraph({"step": function, "read": reader}, {"step": (("x", previous), made), "read": (made, y)})
+    return ep.delay(cg, made, previous, initial)
+
+
+def states(bundle):
+    """Return what each sample began with and left."""
+    return [(sample.state, sample.state_after) for sample in map(read_sample, bundle.samples)]
+
+
+def test_samples_are_a_sequence_from_the_last_run_and_one_run_begins_as_the_service_does(names, tmp_path):
+    runner = ep.CompGraphRunner(smoothing(names), {"k": 0.5, "by": 1})
+    for x in (4.0, 2.0):
+        runner.run(x=x)
+    runner.rerun(k=0.25)
+    bundle = ep.promote(runner, tmp_path / "smooth", samples=[1.5, {"x": 7.5}])
+    assert [(before["before"], after["before"]) for before, after in states(bundle)] == [
+        (4.0, 3.5), (3.5, 3.0), (3.0, 4.125), (None, 2.0),
+    ]  # fmt: skip
+    assert dict(runner.state) == {"before": 3.5}
+    report = verify(bundle.path)
+    assert (report.identical, report.samples, report.tokens) == (True, 4, 8)
+    runner.reset()
+    runner.run(x=1.0)
+    assert len(ep.promote(runner, tmp_path / "smooth").samples) == 1, "that run began as the service does"
+
+
+def test_each_sample_can_be_replayed_without_those_before_it(copied):
+    for name in ("000", "001"):
+        (copied / "samples" / f"{name}.npz").unlink()
+        write_manifest(copied)
+        assert verify(copied).identical
+
+
+@pytest.mark.parametrize(
+    ("side", "key", "token"),
+    [("state_after", "total", "sum"), ("state_after", "inner.before", "inner.smoothed"), ("state", "total", "sum")],
+)
+def test_a_state_that_is_not_the_recorded_one_is_found_with_its_token(copied, side, key, token):
+    path = copied / "samples" / "001.npz"
+    sample = read_sample(path)
+    getattr(sample, side)[key] = getattr(sample, side)[key] + 1.0
+    save_sample(path, **sample._asdict())
+    write_manifest(copied)
+    with pytest.raises(ReplayDiffers, match=f"sample 001, token '{token}': .*kept as '"):
+        verify(copied)
+
+
+def test_a_sample_without_the_states_of_the_settings_is_refused(copied):
+    path = copied / "samples" / "001.npz"
+    sample = read_sample(path)
+    save_sample(path, sample.inputs, sample.outputs)
+    write_manifest(copied)
+    with pytest.raises(BundleError, match="Sample 001 has the states none, which are not those of pipeline.toml"):
+        verify(copied)
+
+
+def test_values_are_written_back_and_the_sequence_is_recorded_with_them(names, tmp_path):
+    runner = ep.CompGraphRunner(smoothing(names), {"k": 0.5, "by": 1})
+    for x in (4.0, 2.0):
+        runner.run(x=x)
+    bundle = ep.promote(runner, tmp_path / "smooth", samples=[1.0])
+    assert "value = 0.25" in write_back(bundle.path, {"k": 0.25}).diff
+    assert [(before["before"], after["before"]) for before, after in states(bundle)] == [
+        (4.0, 3.5), (3.5, 2.875), (None, 2.0),
+    ]  # fmt: skip
+    assert verify(bundle.path).identical
+
+
+@pytest.mark.usefixtures("fresh_interpreter")
+@pytest.mark.parametrize(
+    ("step", "initial", "x", "reason"),
+    [
+        ("drift", 0.0, 2.0, "token 'made'.*in which order function 'step' is called"),
+        ("letters", None, "g", r"token 'made'.*It depends on the hash seed \(PYTHONHASHSEED\)"),
+        ("appended", None, 2.0, "Function 'step' has changed its input 'before' in place"),
+        (
+            "learnt",
+            None,
+            2.0,
+            "State 'before', which token 'made' leaves for the next run, .*Model, which has no codec",
+        ),
+    ],
+)
+def test_state_that_can_not_be_repeated_is_refused_with_its_token_and_the_condition(
+    names, tmp_path, step, initial, x, reason
+):
+    readers = {"drift": names["negated"], "learnt": names["of_model"]}
+    runner = ep.CompGraphRunner(delayed(names[step], initial=initial, reader=readers.get(step, len)))
+    for _ in range(2):
+        runner.run(x=x)
+    with pytest.raises(PromotionRefused, match=reason):
+        ep.promote(runner, tmp_path / "refused")
+
+
+def test_noise_of_threads_in_a_state_becomes_a_tolerance_of_its_token(names, tmp_path):
+    runner = ep.CompGraphRunner(delayed(names["parts"], initial=0.0, reader=round))
+    for _ in range(2):
+        runner.run(x=3.0)
+    bundle = ep.promote(runner, tmp_path / "noise", samples=[1.0, 2.0])
+    assert 0 < bundle.settings.tolerances["made"].relative < 1e-6
+    assert verify(bundle.path).identical
+
+
+def test_a_state_of_keypoints_dicts_and_nan_is_recorded_and_replayed(names, tmp_path):
+    runner = ep.CompGraphRunner(delayed(names["tracked"]))
+    for x in (4.0, 2.0):
+        runner.run(x=x)
+    bundle = ep.promote(runner, tmp_path / "tracks", samples=[1.0])
+    (_, after), _, _ = states(bundle)
+    assert [point.pt[0] for point in after["before"]["points"]] == [4.0, 2.0]
+    assert np.isnan(after["before"]["ago"])
+
+
+def test_a_switch_a_source_token_and_a_delay_of_a_delay_leave_what_they_left_in_the_notebook(names, tmp_path):
+    cg = smoothing(names) | ep.CompGraph({"negated": names["negated"]}, {"negated": ("x", "negative")})
+    cg |= ep.switch("choose", {"on": "y", "off": "negative"}, by="mode", output="chosen")
+    ago = {"one": ("one_before", "last"), "two": ("two_before", "earlier")}
+    cg |= ep.CompGraph(dict.fromkeys(ago, names["negated"]), ago)
+    cg = ep.delay(ep.delay(cg, "x", "one_before", 0), "one_before", "two_before", 0)
+    runner = ep.CompGraphRunner(cg, {"k": 0.5, "by": 10})
+    series = [(4.0, "on"), (100.0, "off"), (2.0, "on"), (8.0, "off"), (6.0, "on")]
+    payloads = [{"x": x, "mode": mode} for x, mode in series]
+    expected = [(run["chosen"], run["earlier"]) for run in map(runner.run_on, payloads)]
+    runner.reset()
+    runner.run_on(payloads[0])
+    bundle = ep.promote(runner, tmp_path / "switch", samples=payloads[1:])
+    again = ep.load(bundle.path)
+    assert [(run["chosen"], run["earlier"]) for run in map(again.run_on, payloads)] == expected
+    left = [after["before"] for _, after in states(bundle)]
+    assert left == [4.0, 4.0, 3.0, 3.0, 4.5]
+    assert bundle.settings.states == {"before": "smoothed", "one_before": "x", "two_before": "one_before"}
+
+
+def test_an_initial_value_that_no_run_takes_or_no_expression_makes_is_refused_with_the_way_out(names, tmp_path):
+    for initial in (None, object()):
+        runner = ep.CompGraphRunner(delayed(names["drift"], initial=initial, reader=names["negated"]))
+        runner.state = {"before": 2.0}
+        runner.run(x=1.0)
+        with pytest.raises(PromotionRefused) as refused:
+            ep.promote(runner, tmp_path / "model")
+        if initial is None:
+            assert "A service begins with the initial state, and the last payload can't be run with it" in str(refused)
+            assert "ep.delay(cg, token, previous, initial=...)" in str(refused.value)
+        else:
+            assert "The initial value of 'before' is of type object, and no expression" in str(refused.value)
+            assert 'ep.delay(cg, "made", "before", initial=None)' in str(refused.value)

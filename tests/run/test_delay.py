@@ -74,6 +74,16 @@ def test_trials_go_through_a_sequence_without_the_runner(runner):
         runner.trial({}, state=first.state)
 
 
+def test_a_run_knows_what_it_began_with(runner, nested):
+    runner.run(x=4)
+    for run in (runner.run(x=2), runner.rerun(k=1.0), runner.trial({"k": 0.25})):
+        assert dict(run.state_before) == {"before": 4}
+    assert runner.trial({}, payload={"x": 1}, state={"before": 7}).state_before["before"] == 7
+    _, outer = nested
+    outer.run(x=4)
+    assert dict(outer.run(x=2).state_before) == {"inner.before": 4}
+
+
 def test_a_run_that_fails_leaves_the_state_as_it_was():
     def half(x, before):
         if x < 0:

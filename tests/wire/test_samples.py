@@ -11,6 +11,7 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import load_sample, save_sample
+from epypes.wire.samples import read_sample
 
 INPUTS = {"image": np.arange(12, dtype=np.uint8).reshape(3, 4), "canny_lo": 70}
 OUTPUTS = {"keypoints": [np.ones(2), {"size of it": np.zeros(1)}], "edges": np.eye(3, dtype=bool), "blob": b"\1\2"}
@@ -95,3 +96,17 @@ def test_a_sample_says_which_tokens_are_rgb_and_gives_them_as_they_were(tmp_path
     (inputs, outputs) = load_sample(tmp_path / "s.npz")
     assert np.array_equal(inputs["left"], image)
     assert np.array_equal(outputs["right"], image)
+
+
+def test_the_state_that_a_run_began_with_and_left_stands_beside_its_tokens(tmp_path):
+    path = tmp_path / "s.npz"
+    before, after = {"total": np.zeros(3), "inner.seen": None}, {"total": np.ones(3), "inner.seen": [1]}
+    save_sample(path, INPUTS, OUTPUTS, state=before, state_after=after)
+    sample = read_sample(path)
+    assert sample.state["total"].tolist() == [0.0, 0.0, 0.0]
+    assert (sample.state["inner.seen"], sample.state_after["inner.seen"]) == (None, [1])
+    assert [side.keys() for side in load_sample(path)] == [INPUTS.keys(), OUTPUTS.keys()]
+    with np.load(path, allow_pickle=False) as archive:
+        assert archive["state_after.total"].tolist() == [1.0, 1.0, 1.0]
+    save_sample(path, INPUTS, OUTPUTS)
+    assert (read_sample(path).state, read_sample(path).state_after) == ({}, {})

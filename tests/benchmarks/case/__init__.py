@@ -15,17 +15,18 @@ _PAPER = "the case system"
 
 
 def rows(effort: Effort) -> list[Row]:
-    from tests.benchmarks.case.measured import EPYPES, EPYPES_THREADS, HAND, HAND_THREADS, measured
+    from tests.benchmarks.case.measured import EPYPES, EPYPES_THREADS, HAND, HAND_THREADS, PUBLISHED, measured
 
     contenders = measured(effort)
     hand, ours = contenders[HAND], contenders[EPYPES]
+    published = {PUBLISHED: contenders[PUBLISHED]} if PUBLISHED in contenders else {}
     pair, threads = {HAND: hand, OURS: ours}, {HAND: contenders[HAND_THREADS], OURS: contenders[EPYPES_THREADS]}
     return [
         row(f"{_PAPER}: trip", _times(pair, "t_trip"), goal=Goal("ratio", 1.03)),
         row(f"{_PAPER}: trip, two at a time", _times(threads, "t_trip"), goal=Goal("ratio", 1.1)),
         row(f"{_PAPER}: o_network", _times(pair, "o_network"), goal=Goal("ratio", 1.2)),
-        _mode_row("vision.o_cg", pair, 20_000, "paper 0.3 ms"),
-        _mode_row("vision.o_epypes", pair, 7_000, "paper 0.02 ms"),
+        _mode_row("vision.o_cg", {**pair, **published}, Goal("total", 60_000), "paper 0.3 ms"),
+        _mode_row("vision.o_epypes", {**pair, **published}, Goal("ratio", 1.7), "paper 0.02 ms"),
         Row(
             f"{_PAPER}: CPU per request", {name: found.cpu_ns for name, found in pair.items()}, goal=Goal("ratio", 1.05)
         ),
@@ -42,8 +43,8 @@ def _times(contenders: Mapping[str, Contender], column: str) -> Times:
     return Times({name: found.durations[column] for name, found in contenders.items()})
 
 
-def _mode_row(column: str, contenders: Mapping[str, Contender], most_ns: float, note: str) -> Row:
+def _mode_row(column: str, contenders: Mapping[str, Contender], goal: Goal, note: str) -> Row:
     from epypes.experiment.results import lognormal_fit
 
     modes = {name: lognormal_fit(list(found.durations[column].values())).mode for name, found in contenders.items()}
-    return Row(f"{_PAPER}: {column}, mode", modes, goal=Goal("total", most_ns), note=note)
+    return Row(f"{_PAPER}: {column}, mode", modes, goal=goal, note=note)

@@ -1,4 +1,4 @@
-"""How does a robot ask the hand-written vision process, without EPypes?"""
+"""How does a robot ask a vision process that is not of this EPypes?"""
 
 from __future__ import annotations
 
@@ -17,10 +17,18 @@ _TIMEOUT_MS = 10_000
 
 
 class ByHand:
-    """A hand-written vision process, and the robot's two sockets to it, in the thread that asks."""
+    """A vision process, hand-written or of the published package, and the robot's two sockets to it.
 
-    def __init__(self, threads: int) -> None:
-        command = [sys.executable, "-m", "tests.benchmarks.case.hand_vision", str(threads)]
+    Parameters
+    ----------
+    argument
+        The number of threads; of the published package its folder.
+    module
+        Which process.
+    """
+
+    def __init__(self, argument: int | str, module: str = "hand_vision") -> None:
+        command = [sys.executable, "-m", f"tests.benchmarks.case.{module}", str(argument)]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._count = 0
 

@@ -112,16 +112,22 @@ def _respond(request: bytes, pair: tuple[np.ndarray, np.ndarray], features: Feat
     return message.SerializeToString()
 
 
-def main(threads: int) -> None:
-    left, right, _ = data.stereo_motorcycle()
-    pair = (cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
-    context = zmq.Context()
+def bound(context: zmq.Context[Any]) -> tuple[Any, Any, dict[str, str]]:
+    """Return the sockets for requests and responses, and their addresses."""
     requests, responses = context.socket(zmq.SUB), context.socket(zmq.PUB)
     requests.subscribe(b"")
     addresses = {}
     for name, socket in (("requests", requests), ("responses", responses)):
         socket.bind(ANY)
         addresses[name] = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+    return requests, responses, addresses
+
+
+def main(threads: int) -> None:
+    left, right, _ = data.stereo_motorcycle()
+    pair = (cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
+    context = zmq.Context()
+    requests, responses, addresses = bound(context)
     print(json.dumps(addresses), flush=True)
     poller = zmq.Poller()
     poller.register(requests, zmq.POLLIN)

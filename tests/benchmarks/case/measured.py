@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from epypes.experiment.layouts import LAYOUTS, running
 from epypes.experiment.nodes import Settings
@@ -18,6 +20,8 @@ from tests.benchmarks.case.by_hand import ByHand
 from tests.benchmarks.timing import Effort
 
 HAND, EPYPES, HAND_THREADS, EPYPES_THREADS = "by hand", "EPypes", "by hand, two threads", "EPypes, workers=2"
+# Left out where `make bench` has not installed it.
+PUBLISHED, PUBLISHED_FOLDER = "EPypes 0.1.1", Path(sys.prefix, "published")
 _ROUNDS, _WARM_ROUNDS, _IDLE_S = 250, 10, 5.0
 _QUICK_ROUNDS, _QUICK_IDLE_S = 3, 0.2
 
@@ -50,11 +54,14 @@ def measured(effort: Effort) -> Mapping[str, Contender]:
     rounds, idle_s = (_QUICK_ROUNDS, _QUICK_IDLE_S) if effort.quick else (_ROUNDS, _IDLE_S)
     with ExitStack() as stack:
         contenders = {
-            HAND: stack.enter_context(_by_hand(1)),
+            HAND: stack.enter_context(_by_hand(ByHand(1))),
             EPYPES: stack.enter_context(_epypes(1)),
-            HAND_THREADS: stack.enter_context(_by_hand(2)),
+            HAND_THREADS: stack.enter_context(_by_hand(ByHand(2))),
             EPYPES_THREADS: stack.enter_context(_epypes(2)),
         }
+        if PUBLISHED_FOLDER.is_dir():
+            published = ByHand(str(PUBLISHED_FOLDER), "published_vision")
+            contenders[PUBLISHED] = stack.enter_context(_by_hand(published))
         for _ in range(_WARM_ROUNDS):
             for contender in contenders.values():
                 contender.take(None)
@@ -91,8 +98,8 @@ def cpu_ns(pid: int) -> int:
 
 
 @contextmanager
-def _by_hand(threads: int) -> Iterator[Contender]:
-    with ByHand(threads) as system:
+def _by_hand(system: ByHand) -> Iterator[Contender]:
+    with system:
 
         def ask() -> dict[str, float]:
             t_trip, answer = system.ask()
