@@ -66,6 +66,7 @@ def stateful_bundle(folder, *, k=1, initial=0, source=SOURCE):
         hyperparameters={"k": k},
         sample=({"what": "plain", "number": 3}, {"out": (3 + initial) * k}),
         states={"before": "total"},
+        state=({"before": initial}, {"before": 3 + initial}),
     )
 
 

@@ -59,6 +59,7 @@ def smoothing(tmp_path_factory):
         ("sum", "pixel"),
         sample=({"what": "plain", "number": 3}, {"sum": first.sum(), "pixel": first[3, 4]}),
         states={"before": "smoothed"},
+        state=({"before": None}, {"before": first}),
     )
 
 
