@@ -56,7 +56,7 @@ SOURCE = '''
 '''
 
 
-def stateful_bundle(folder, *, k=1, initial=0, source=SOURCE):
+def stateful_bundle(folder, *, k=1, initial=0, source=SOURCE, prefix=""):
     """Write a bundle whose answer is ``k`` times the sum of the numbers so far."""
     return written_bundle(
         folder,
@@ -65,8 +65,8 @@ def stateful_bundle(folder, *, k=1, initial=0, source=SOURCE):
         ("out",),
         hyperparameters={"k": k},
         sample=({"what": "plain", "number": 3}, {"out": (3 + initial) * k}),
-        states={"before": "total"},
-        state=({"before": initial}, {"before": 3 + initial}),
+        states={f"{prefix}before": f"{prefix}total"},
+        state=({f"{prefix}before": initial}, {f"{prefix}before": 3 + initial}),
     )
 
 

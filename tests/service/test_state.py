@@ -7,17 +7,22 @@ import re
 import signal
 import warnings
 
+import cv2
+import numpy as np
 import pytest
 
 import epypes as ep
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
+from epypes.service.frame_socket import WorkerMessage
 from epypes.service.http import HttpServer
+from epypes.wire import decode, encode
 from tests.service.processes import running
-from tests.service.served import acting_bundle, peer_of, serving, until
-from tests.service.stateful import send_from, stateful_bundle, sums
+from tests.service.served import acting_bundle, event, peer_of, serving, until
+from tests.service.stateful import SOURCE, send_from, stateful_bundle, sums
 from tests.service.states import read_state
 from tests.service.test_brokered import line_of
+from tests.service.workers import ready_worker
 
 pytestmark = pytest.mark.slow
 
@@ -89,9 +94,10 @@ def test_an_event_that_fails_leaves_the_state_as_it_was(adding, quick, what, why
         assert sums(peer, 5) == [15]
 
 
-def test_the_first_event_may_fail(adding):
+@pytest.mark.parametrize("what", ["fail late", "fail answer"])
+def test_after_a_first_event_that_fails_the_next_one_begins_with_the_initial_state(adding, what):
     with serving(adding) as (_, peer):
-        assert peer.ask("fail late", 100).failure is not None
+        assert peer.ask(what, 100).failure is not None
         assert sums(peer, 1) == [1]
 
 
@@ -112,6 +118,39 @@ def test_a_drained_service_that_is_resumed_goes_on(adding):
         # The socket is bound again, and a publisher joins by itself.
         until(lambda: peer.ask(number=0).parts["out"] == 1)
         assert sums(peer, 2) == [3]
+
+
+def test_a_promoted_graph_goes_on_with_its_pictures(photograph, tmp_path, quick):
+    mix = ep.CompGraph({"mix": cv2.addWeighted}, {"mix": (("image", "new", "before", "old", "offset"), "mixed")})
+    runner = ep.CompGraphRunner(
+        ep.delay(mix, "mixed", "before", np.zeros_like(photograph)), {"new": 0.25, "old": 0.75, "offset": 0}
+    )
+    images = [np.roll(photograph, shift, 0) for shift in (0, 9, 18, 27)]
+    expected = [runner.run(image=image)["mixed"] for image in images]
+    runner.reset()
+    runner.run(image=images[0])
+    with serving(ep.promote(runner, tmp_path / "mix").path) as (service, peer):
+        for image, mixed in zip(images, expected, strict=True):
+            peer.send_parts(image=image)
+            assert np.array_equal(peer.take()[0].parts["mixed"], mixed)
+            kill_worker(service)
+
+
+def test_a_nested_pipeline_has_its_state_too(tmp_path, quick):
+    nested = (
+        SOURCE[: SOURCE.index("    def with_delays")]
+        + """
+    cg = ep.CompGraph({"add": add}, {"add": (("what", "number", "before"), "total")})
+    func_dict = {"sum": ep.Pipeline("sum", ep.delay(cg, "total", "before", 0)), "check": check}
+    func_io = {"sum": (("what", "number"), "total"), "check": (("what", "total", "k"), "out")}
+    """
+    )
+    bundle = stateful_bundle(tmp_path / "nested", source=nested, prefix="sum.")
+    with serving(bundle) as (service, peer):
+        assert sums(peer, 1, 2) == [1, 3]
+        kill_worker(service)
+        assert sums(peer, 3) == [6]
+        assert service.info()["states"]["tokens"] == {"sum.before": "sum.total"}
 
 
 # -- a state for each source ------------------------------------------------------------------------------------------
@@ -167,6 +206,34 @@ def test_the_source_that_was_silent_for_the_longest_time_is_forgotten(adding, mo
         assert sums(peer, 1, source="first") == [3]
         assert sums(peer, 2, source="second") == [2]
         assert "state of source 'second' is forgotten" in caplog.text
+
+
+def test_a_worker_keeps_no_state_that_the_front_has_forgotten(adding, tmp_path):
+    with ready_worker(adding, tmp_path) as front:
+
+        def run(seq, **content):
+            front.channel.send(WorkerMessage("event", seq, content, encode(event(number=seq))))
+            header, answer = done(front)
+            assert header["failure"] is None
+            return answer.parts["out"]
+
+        assert run(1, key="left", state="initial") == 1
+        assert run(2, key="left", state="held") == 3
+        # It has had an event since the front forgot it.
+        assert run(3, key="right", state="initial", forget={"left": 1}) == 3
+        assert run(4, key="left", state="held") == 7
+        assert run(5, key="right", state="held", forget={"left": 4}) == 8
+        front.channel.send(WorkerMessage("event", 6, {"key": "left", "state": "held"}, encode(event())))
+        header, answer = done(front)
+        assert (header["failure"]["function"], answer.failure.exception) == ("f_in", "KeyError")
+
+
+def done(front):
+    """Return the contents of the next ``done`` message, and its one answer; the state comes after its frames."""
+    message = front.receive("done")
+    (size,) = message.content["answers"]
+    assert len(message.frames) == size + message.content.get("has_state", False)
+    return message.content, decode(message.frames[:size])
 
 
 # -- reset ------------------------------------------------------------------------------------------------------------
@@ -331,8 +398,6 @@ def test_a_worker_that_is_killed_is_looked_into_with_the_state_of_its_event(tmp_
 
 def stateful_source_that_dies_at(before):
     """Return the source of a bundle whose second function kills the process if the sum before was this."""
-    from tests.service.stateful import SOURCE
-
     return SOURCE.replace(
         "def check(what, total, k):",
         "def check(what, total, k, before):\n"
