@@ -33,7 +33,8 @@ class Options:
         ``failure``: an address is bound, ``connect:ADDRESS`` is connected to. ``tcp://127.0.0.1:*`` takes any free
         port. Or the address of a broker, as ``amqp://HOST/QUEUE``.
     threads
-        How many events are worked on at once; answers keep the order of the events.
+        How many events are worked on at once; answers keep the order of the events, with a state per source that of the
+        events of each source.
     job_timeout_s
         How long an event may take, in seconds. An event that takes longer has failed, and the worker is replaced.
     retries
