@@ -113,6 +113,18 @@ def test_a_run_that_does_not_need_the_token_leaves_the_state_as_it_was():
     assert runner.run(x=1)["total"] == 4
 
 
+def test_a_rerun_for_other_tokens_keeps_what_the_frame_has_left(runner):
+    runner.run(x=4)
+    runner.run(x=2)
+    cg = ep.extend(runner.cg, {"negate": lambda x: -x}, {"negate": ("x", "negative")})
+    other = ep.CompGraphRunner(cg, runner.hyperparameters)
+    for x in (4, 2):
+        other.run(x=x)
+    other.rerun("negative", k=1.0)
+    assert "smoothed" not in other
+    assert dict(other.state) == {"before": 3}
+
+
 def test_reset_begins_anew_and_a_rerun_still_repeats_the_last_run(runner):
     runner.run(x=4)
     runner.run(x=2)
