@@ -54,6 +54,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from epypes.wording import keep_as_state
+
 if TYPE_CHECKING:
     from epypes.bundle.replay import ReplayReport
     from epypes.images import Image
@@ -233,7 +235,7 @@ class StateChanged(EpypesError, RuntimeError):
         )
         super().__init__(
             f"Function {function!r} changed {changed!r}, which outlives the call. {became}. "
-            "Change a copy of it, or make it a token."
+            f"Change a copy of it. {keep_as_state(changed, is_object=not is_restored)}."
         )
 
 

@@ -1,6 +1,8 @@
-"""How are numbers of things, and what others say, written in a sentence?"""
+"""Wording: numbers of things, what exceptions say, and ways out that several errors name."""
 
 from __future__ import annotations
+
+import re
 
 
 def counted(count: int, noun: str) -> str:
@@ -12,3 +14,29 @@ def ended(text: str) -> str:
     """Return a text with a full stop, unless it has an end of its own: what an exception says may be a sentence."""
     text = text.rstrip()
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def keep_as_state(name: str, initial: str = "None", *, is_object: bool = False) -> str:
+    """Return the way out for what a function keeps from call to call: a sentence with a line that can be pasted.
+
+    Parameters
+    ----------
+    name
+        How the code calls it, such as ``"SEEN"`` or ``"tracker.points"``.
+    initial
+        The expression of what it begins with.
+    is_object
+        Whether it is an object that can't be a token itself.
+
+    Examples
+    --------
+    >>> keep_as_state("N", "0")
+    "To keep it from event to event, take 'n_before' and make 'n': cg = ep.delay(cg, 'n', 'n_before', initial=0)"
+    """
+    found = re.search(r"[^\W\d]\w*$", name)
+    token = (found[0].strip("_").lower() if found else "") or "state"
+    what = "what it remembers, as numbers or arrays," if is_object else "it"
+    return (
+        f"To keep {what} from event to event, take '{token}_before' and make '{token}': "
+        f"cg = ep.delay(cg, '{token}', '{token}_before', initial={initial})"
+    )

@@ -69,8 +69,8 @@ class Condition:
 CALL: Final = Condition(
     "when, how often and in which order function {function!r} is called",
     "Pass a seed as a token and make the random generator of it, as in np.random.default_rng(seed), or call "
-    "cv2.setRNGSeed(seed) inside the function. Pass a time, and what it remembers from call to call, as tokens. Round "
-    "noise of threads away before it decides anything.",
+    "cv2.setRNGSeed(seed) inside the function. Pass a time as a token. What it remembers from call to call is state of "
+    'the graph: cg = ep.delay(cg, "seen", "seen_before"). Round noise of threads away before it decides anything.',
 )
 PROCESS: Final = Condition(
     "the process that computes it",
@@ -78,8 +78,8 @@ PROCESS: Final = Condition(
 )
 UNKNOWN: Final = Condition(
     "what only the notebook has, or on several conditions at once",
-    "If an array was written into after the run, run the graph again. A file, the current folder, or what a function "
-    "remembers is to be a token.",
+    "If an array was written into after the run, run the graph again. Pass a file or the current folder as a token. "
+    'What a function remembers is state of the graph: cg = ep.delay(cg, "seen", "seen_before").',
 )
 
 

@@ -38,7 +38,15 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from typing import Any, Final
 
-from epypes.bundle.references import cells_of, defaults_of, global_names, imported_modules, meanings_of, nested_codes
+from epypes.bundle.references import (
+    cells_of,
+    defaults_of,
+    global_names,
+    imported_modules,
+    is_model_of_cv2,
+    meanings_of,
+    nested_codes,
+)
 from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
@@ -69,8 +77,6 @@ _OF_PYTHON: Final = frozenset(
     | {"__annotations__", "__annotations_cache__", "__annotate__", "__annotate_func__", "__static_attributes__"}
     | {"_value2member_map_", "__slotnames__"}
 )
-# Objects of these classes of OpenCV remember what they are given, where Python can't see it.
-_MODELS_OF_CV2: Final = frozenset({"BackgroundSubtractor", "KalmanFilter", "Tracker", "VideoCapture", "VideoWriter"})
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
@@ -170,7 +176,7 @@ class CodeSnapshot(Snapshot):
             lazy = cached_properties(kind)
             if lazy:
                 self.resets.append(functools.partial(_forget, value, lazy))
-        elif not _MODELS_OF_CV2.isdisjoint(base.__name__ for base in kind.__mro__ if base.__module__[:3] == "cv2"):
+        elif is_model_of_cv2(value):
             self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
             # A library's own code may not take read-only arrays.

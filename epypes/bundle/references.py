@@ -17,6 +17,7 @@ from typing import Any, Final
 # A class reads the name of the module around it, whichever that is, and has its own annotations.
 _OF_EVERY_CLASS: Final = frozenset({"__name__", "__annotations__"})
 _LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
+_MODELS_OF_CV2: Final = frozenset({"BackgroundSubtractor", "KalmanFilter", "Tracker", "VideoCapture", "VideoWriter"})
 
 
 def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
@@ -102,3 +103,14 @@ def defaults_of(function: types.FunctionType) -> dict[str, Any]:
     given, code = function.__defaults__ or (), function.__code__
     names = code.co_varnames[: code.co_argcount]
     return dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
+
+
+def is_model_of_cv2(value: Any) -> bool:
+    """Whether an object of OpenCV remembers what it is given, where Python can't see it."""
+    bases = (base.__name__ for base in type(value).__mro__ if base.__module__[:3] == "cv2")
+    return not _MODELS_OF_CV2.isdisjoint(bases)
+
+
+def may_remember(value: Any) -> bool:
+    """Whether an object most likely keeps something from call to call: of a user's class, an iterator, such a model."""
+    return type(value).__module__ == "__main__" or hasattr(type(value), "__next__") or is_model_of_cv2(value)

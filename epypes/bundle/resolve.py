@@ -26,9 +26,10 @@ from functools import lru_cache
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, Final, TypeGuard
 
-from epypes.bundle.references import captured_by, global_names, namespace_of, nested_codes
+from epypes.bundle.references import captured_by, global_names, may_remember, namespace_of, nested_codes
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
+from epypes.wording import keep_as_state
 
 _CELL_MAGIC: Final = "get_ipython().run_cell_magic("
 _EXECUTING: Final = ("capture", "time", "prun")
@@ -490,7 +491,9 @@ def _no_definition(value: Any, innermost: Any, what: str) -> str:
     methods = functions_of(kind).values() if importable(kind) is None else ()
     places += [place_of(function.__code__) for function in (*methods, innermost) if is_of_notebook(function)]
     where = f" ({places[0]})" if places else ""
-    return f"{what} is {text}{where}. Write a plain function (def) that makes the object and calls it."
+    way_out = "Write a plain function (def) that makes the object and calls it."
+    way_out += f" {keep_as_state('state', is_object=True)}." if may_remember(owner) else ""
+    return f"{what} is {text}{where}. {way_out}"
 
 
 # -- the parts of definitions ----------------------------------------------------------------------------------------

@@ -28,12 +28,15 @@ from epypes.bundle.resolve import (
     place_in,
 )
 from epypes.run.guard import is_plain_array
+from epypes.wording import keep_as_state
 
 # By module or class of a library and the name there: the place in the notebook that changes it.
 Patches = Mapping[tuple[Any, str], str]
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
 
+# What begins as a literal of its type without content.
+_EMPTY: Final = frozenset({bool, int, float, str, list, dict, tuple})
 # Methods of lists, dicts, sets, deques and arrays that change them.
 CHANGING: Final = frozenset(
     {
@@ -69,16 +72,24 @@ def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None,
             for name in filter(stored.__contains__, part.names):
                 if isinstance(part, ast.Global):
                     place = place_in(file, stored[name].lineno)
-                    raise Refused(f"{what} changes the global {name!r} ({place}). Return the value.")
+                    raise Refused(f"{what} changes the global {name!r} ({place}). Return it. {_as_state(name, names)}")
                 if name in outside:
                     text = f"{what} changes {name!r} of the function around it ({place_in(file, part.lineno)})"
-                    raise Refused(f"{text}, so that the next call finds it different. Make it a token, or return it.")
+                    raise Refused(f"{text}: the next call would find it different. Return it. {_as_state(name, names)}")
         for written in _written(part):
             name = _root(written)
             is_plain = isinstance(getattr(written, "ctx", None), ast.Store | ast.Del)
             if name in outside and (is_plain or _is_container(written, names)):
                 text = f"{what} writes into {name!r}, which outlives the call ({place_in(file, written.lineno)})"
-                raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
+                text = f"{text}: the next event would find it different. Write into a copy of it."
+                raise Refused(f"{text} {_as_state(name, names)}")
+
+
+def _as_state(name: str, names: Mapping[str, Any]) -> str:
+    """Return how to keep the value of a name from event to event; it begins empty, as it most likely did."""
+    value = names.get(name)
+    kind: type[Any] = type(value)
+    return f"{keep_as_state(name, repr(kind()) if kind in _EMPTY else 'None')}."
 
 
 def _written(node: ast.AST) -> Iterator[ast.expr]:

@@ -35,7 +35,7 @@ from epypes.bundle.expressions import (
     names_in,
     quoted,
 )
-from epypes.bundle.references import is_of_ipython
+from epypes.bundle.references import is_of_ipython, may_remember
 from epypes.bundle.resolve import (
     LATE_ANNOTATIONS,
     Definition,
@@ -63,6 +63,7 @@ from epypes.bundle.side_effects import (
     patches_in_notebook,
 )
 from epypes.run.guard import is_plain_array
+from epypes.wording import keep_as_state
 
 T = TypeVar("T")
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -337,6 +338,8 @@ class Slice:
             way_out = f"Make {name} a token, make it {place}"
         elif type(value).__module__ == "__main__":
             way_out += ", or make its class a dataclass"
+        if may_remember(value):
+            way_out += f". {keep_as_state('state' if name == 'it' else name, is_object=True)}"
         raise Refused(f"{reason}. {way_out}.")
 
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:

@@ -23,7 +23,7 @@ from epypes.pipeline.pipeline import Pipeline
 # woken without putting a sentinel into them, which would be an event of theirs.
 POLL_S: Final = 0.05
 # Of a queue that has been empty for a while: to wake up takes up to 100 us of a core.
-LONGEST_POLL_S: Final = 0.2
+LONGEST_POLL_S: Final = 0.25
 
 _log: Final = logging.getLogger("epypes.pipeline")
 

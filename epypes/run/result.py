@@ -107,12 +107,10 @@ class Run(TokenMapping):
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
         values, *_, failure = self.record
-        program, stale = self.record[4].program, self.tokens.stale
+        # Of a rerun for other targets the value may be stale: it is still what the frame has left.
         return tuple(
-            values[slots.before]
-            if failure or values[slots.after] is NOT_COMPUTED or program.makers[slots.after] in stale
-            else values[slots.after]
-            for slots in program.states
+            values[slots.before] if failure or values[slots.after] is NOT_COMPUTED else values[slots.after]
+            for slots in self.record[4].program.states
         )
 
     @property

@@ -195,9 +195,9 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "global write": ("N = 0\ndef f(a):\n    global N\n    N += 1\n    return N", "f", r"changes the global 'N' \(cell \[1\], line 4\)\. Return"),
     "nonlocal": (
         "def make(n):\n    def f(a):\n        nonlocal n\n        n += 1\n        return n\n    return f\nf = make(0)", "f",
-        r"changes 'n' of the function around it \(cell \[1\], line 3\).*Make it a token",
+        r"changes 'n' of the function around it \(cell \[1\], line 3\).*Return it\. .*cg = ep\.delay\(cg, 'n', 'n_before', initial=0\)",
     ),
-    "dict that is written into": ("SEEN = {}\ndef f(a):\n    SEEN[a.size] = 1\n    return a", "f", r"writes into 'SEEN', .*\(cell \[1\], line 3\).* Copy it first"),
+    "dict that is written into": ("SEEN = {}\ndef f(a):\n    SEEN[a.size] = 1\n    return a", "f", r"writes into 'SEEN', .*\(cell \[1\], line 3\).* Write into a copy of it.*, initial=\{\}\)\."),
     "list that grows": ("LOG = []\ndef f(a):\n    LOG.append(a)\n    return a", "f", r"writes into 'LOG', .*\(cell \[1\], line 3\)"),
     "attribute of itself": ("def f(a):\n    f.count = 1\n    return a", "f", r"writes into 'f', .*\(cell \[1\], line 2\)"),
     "closure that keeps": (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import re
 import shutil
 import subprocess
 import sys
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.batch.cache import graph_fingerprint
 from epypes.bundle import verify
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
+from epypes.bundle.replay import replay
 from epypes.bundle.settings import read_settings
 from epypes.bundle.writeback import write_back
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers
@@ -69,6 +72,10 @@ def appended(x, known):
 def tracked(x, known):
     points = known["points"] if known else []
     return {"points": [*points, cv2.KeyPoint(x, 1.0, 2.0)], "sizes": np.array([np.nan, x]), "ago": float("nan")}
+
+
+def kept(x, before):
+    return {"last": x, "seen": [*before.get("seen", ()), x]}
 
 
 class Model:
@@ -171,16 +178,19 @@ def test_a_bundle_with_state_is_promoted_again_to_the_same_text(promoted, tmp_pa
 
 
 def test_another_delay_or_initial_value_is_another_bundle(names, tmp_path):
-    digests = set()
+    digests, fingerprints, texts = set(), set(), set()
     for number, initial in enumerate((0.0, -0.0, float("nan"), 0)):
         cg = ep.CompGraph({"smooth": names["scale"]}, {"smooth": (("x", "before"), "y")})
         runner = ep.CompGraphRunner(ep.delay(cg, "y", "before", initial))
         runner.run(x=1)
         bundle = ep.promote(runner, tmp_path / f"{number}")
         digests.add(bundle.digest)
+        text = (bundle.path / "pipeline.py").read_text()
+        texts.add(re.sub(r"initial=.*\)\n|graph \d", "", text))
+        fingerprints.add((graph_fingerprint(runner.cg).code, graph_fingerprint(runner.cg).state))
         ((key, value),) = ep.load(bundle.path).state.items()
         assert (key, repr(value)) == ("before", repr(initial))
-    assert len(digests) == 4
+    assert (len(digests), len(fingerprints), len(texts)) == (4, 4, 1), "one line of the module differs"
 
 
 def test_states_that_module_and_settings_name_otherwise_are_refused(promoted, tmp_path):
@@ -246,6 +256,19 @@ def test_a_state_that_is_not_the_recorded_one_is_found_with_its_token(copied, si
     write_manifest(copied)
     with pytest.raises(ReplayDiffers, match=f"sample 001, token '{token}': .*kept as '"):
         verify(copied)
+
+
+def test_a_replay_goes_on_from_what_it_has_left_and_not_from_what_was_recorded(copied):
+    first, second = (copied / "samples" / f"{name}.npz" for name in ("000", "001"))
+    sample, following = read_sample(first), read_sample(second)
+    for side in (sample.state_after, following.state):
+        side["total"] = side["total"] + 1.0
+    save_sample(first, **sample._asdict())
+    save_sample(second, **following._asdict())
+    found = replay(read_bundle(copied, compare=False)).differences
+    assert [(entry.sample, entry.token) for entry in found] == [("000", "sum")]
+    found = replay(read_bundle(copied, compare=False), twice=True).differences
+    assert ("001", "y") in [(entry.sample, entry.token) for entry in found], "alone it begins as recorded"
 
 
 def test_a_sample_without_the_states_of_the_settings_is_refused(copied):
@@ -334,6 +357,18 @@ def test_a_switch_a_source_token_and_a_delay_of_a_delay_leave_what_they_left_in_
     assert bundle.settings.states == {"before": "smoothed", "one_before": "x", "two_before": "one_before"}
 
 
+def test_a_rerun_that_chose_another_branch_is_no_sample_since_no_run_leaves_its_state(names, tmp_path):
+    cg = smoothing(names) | ep.CompGraph({"negated": names["negated"]}, {"negated": ("x", "negative")})
+    cg |= ep.switch("choose", {"on": "y", "off": "negative"}, by="mode", output="chosen")
+    runner = ep.CompGraphRunner(cg, {"k": 0.5, "by": 1, "mode": "on"})
+    runner.run(x=4.0)
+    runner.rerun(mode="off")
+    with pytest.raises(PromotionRefused, match=r"left for 'before' what function 'smooth' made .*runner\.run|run\(x="):
+        ep.promote(runner, tmp_path / "switch")
+    runner.run(x=2.0)
+    ep.promote(runner, tmp_path / "switch")
+
+
 def test_an_initial_value_that_no_run_takes_or_no_expression_makes_is_refused_with_the_way_out(names, tmp_path):
     for initial in (None, object()):
         runner = ep.CompGraphRunner(delayed(names["drift"], initial=initial, reader=names["negated"]))
@@ -347,3 +382,75 @@ def test_an_initial_value_that_no_run_takes_or_no_expression_makes_is_refused_wi
         else:
             assert "The initial value of 'before' is of type object, and no expression" in str(refused.value)
             assert 'ep.delay(cg, "made", "before", initial=None)' in str(refused.value)
+
+
+# By what keeps something from call to call: a cell that defines `step`, and the line that the reason names.
+KEPT = {
+    "a global": ("N = 0\ndef step(x):\n    global N\n    N += 1\n    return x + N", "'n', 'n_before', initial=0"),
+    "a list": ("SEEN = []\ndef step(x):\n    SEEN.append(x)\n    return x", "'seen', 'seen_before', initial=[]"),
+    "a closure": (
+        "def make():\n    n = 0.0\n    def step(x):\n        nonlocal n\n        n += x\n        return n\n    return step\n"
+        "step = make()",
+        "'n', 'n_before', initial=0.0",
+    ),
+    "a mutable default": (
+        "def step(x, seen=[]):\n    seen.append(x)\n    return x",
+        "'seen', 'seen_before', initial=None",
+    ),
+    "a cache": (
+        "import functools\n@functools.cache\ndef seen():\n    return []\ndef step(x):\n    seen().append(x)\n    return x",
+        "'seen', 'seen_before', initial=None",
+    ),
+    "a background model": (
+        "import cv2\nimport numpy as np\nMODEL = cv2.createBackgroundSubtractorMOG2()\n"
+        "def step(x):\n    return MODEL.apply(np.full((9, 9), x))",
+        "'model', 'model_before', initial=None",
+    ),
+    "an object with a method": (
+        "class Counter:\n    n = 0\n    def step(self, x):\n        self.n += 1\n        return x + self.n\n"
+        "step = Counter().step",
+        "'state', 'state_before', initial=None",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", KEPT)
+def test_state_outside_of_the_graph_is_refused_with_a_line_that_makes_it_a_delay(what, tmp_path):
+    source, line = KEPT[what]
+    runner = ep.CompGraphRunner(ep.CompGraph({"step": cell(source)["step"]}, {"step": ("x", "y")}))
+    runner.run(x=3)
+    with pytest.raises(PromotionRefused) as refused:
+        ep.promote(runner, tmp_path / "kept")
+    (reason,) = refused.value.reasons
+    assert f"cg = ep.delay(cg, {line})." in reason
+
+
+def test_the_line_of_a_refusal_can_be_pasted(tmp_path):
+    text = "SEEN = []\ndef step(x):\n    SEEN.append(x)\n    return sum(SEEN)\n"
+    cg = ep.CompGraph({"step": cell(text)["step"]}, {"step": ("x", "y")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run(x=3)
+    with pytest.raises(PromotionRefused) as refused:
+        ep.promote(runner, tmp_path / "kept")
+    line = re.search(r"cg = ep\.delay\(.*\)", refused.value.reasons[0])[0]
+    step = "def step(x, seen_before):\n    seen = [*seen_before, x]\n    return seen, sum(seen)\n"
+    graph = 'cg = ep.CompGraph({"step": step}, {"step": (("x", "seen_before"), ("seen", "y"))})\n'
+    names = cell(f"import epypes as ep\n{step}{graph}{line}\n")
+    runner = ep.CompGraphRunner(names["cg"])
+    assert [runner.run(x=x)["y"] for x in (3, 4)] == [3, 7]
+    bundle = ep.promote(runner, tmp_path / "kept", outputs=["y"])
+    assert [ep.load(bundle.path).run(x=x)["y"] for x in (3, 4)] == [3, 4]
+
+
+def test_the_state_of_a_runner_is_no_hidden_state_of_the_functions(names, tmp_path):
+    """Arrays, dicts and lists that a run leaves are compared with nothing: only what functions refer to is."""
+    inner = ep.Pipeline("inner", ep.delay(ep.CompGraph({"a": names["kept"]}, {"a": (("x", "b"), "m")}), "m", "b", {}))
+    cg = ep.CompGraph({"inner": inner, "keep": names["kept"]}, {"inner": ("x", "m"), "keep": (("m", "b"), "k")})
+    runner = ep.CompGraphRunner(ep.delay(cg, "k", "b", {}))
+    runner.run(x=1)
+    again = ep.load(ep.promote(runner, tmp_path / "kept").path)
+    for x in range(3):
+        run = again.run(x=x)
+        assert again.rerun()["k"] == run["k"]
+    assert again.state["inner.b"] == {"last": 2, "seen": [0, 1, 2]}
+    assert len(again.state["b"]["seen"]) == 3

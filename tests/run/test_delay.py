@@ -113,6 +113,18 @@ def test_a_run_that_does_not_need_the_token_leaves_the_state_as_it_was():
     assert runner.run(x=1)["total"] == 4
 
 
+def test_a_rerun_for_other_tokens_keeps_what_the_frame_has_left(runner):
+    runner.run(x=4)
+    runner.run(x=2)
+    cg = ep.extend(runner.cg, {"negate": lambda x: -x}, {"negate": ("x", "negative")})
+    other = ep.CompGraphRunner(cg, runner.hyperparameters)
+    for x in (4, 2):
+        other.run(x=x)
+    other.rerun("negative", k=1.0)
+    assert "smoothed" not in other
+    assert dict(other.state) == {"before": 3}
+
+
 def test_reset_begins_anew_and_a_rerun_still_repeats_the_last_run(runner):
     runner.run(x=4)
     runner.run(x=2)
@@ -217,6 +229,17 @@ def test_the_state_of_a_nested_pipeline_belongs_to_the_run_of_the_outer_graph(ne
     assert runner.run(x=1)["z"] == 22
     runner.reset()
     assert runner.run(x=1)["z"] == 12
+
+
+def test_a_switch_that_leaves_a_nested_pipeline_out_keeps_its_state():
+    cg = ep.CompGraph(
+        {"inner": ep.Pipeline("inner", smoothing(), {"k": 0.5, "by": 1}), "raw": lambda x: -x},
+        {"inner": ("x", "y"), "raw": ("x", "negative")},
+    )
+    cg |= ep.switch("choose", {"on": "y", "off": "negative"}, by="mode", output="chosen")
+    runner = ep.CompGraphRunner(cg)
+    assert [runner.run(x=x, mode=mode)["chosen"] for x, mode in ((4, "on"), (100, "off"), (2, "on"))] == [4, -100, 3]
+    assert dict(runner.run(x=100, mode="off").state) == {"inner.before": 3}
 
 
 def test_a_nested_pipeline_with_several_outputs_and_one_inside_it():

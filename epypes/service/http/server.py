@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
 import re
 import socket
 import sys
@@ -16,17 +17,20 @@ import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import AddressError, ServiceError
 from epypes.service.state_file import state_file
 from epypes.transport import is_loopback_host
+from epypes.transport.throttle import Throttle
 
 if TYPE_CHECKING:
     import uvicorn
     from fastapi import FastAPI
 
     from epypes.service import Service
+
+_throttle: Final = Throttle(logging.getLogger("epypes.service"))
 
 _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 3.0
@@ -127,6 +131,15 @@ def _bounded_protocol() -> type[asyncio.Protocol]:
     return BoundedProtocol
 
 
+def _report_briefly(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Write one line where asyncio has a traceback for each caller that it can't accept."""
+    error = context.get("exception")
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        _throttle.warning("accept", f"HTTP can't accept a connection: {error.strerror}")
+    else:
+        loop.default_exception_handler(context)
+
+
 class HttpServer:
     """The HTTP control of one service; use it in a ``with`` statement, or start and stop it.
 
@@ -203,6 +216,7 @@ class HttpServer:
 
     def _new_server(self, token: str, hosts: set[str]) -> uvicorn.Server:
         import uvicorn
+        from starlette.concurrency import run_in_threadpool
 
         from epypes.service.http.app import create_app
         from epypes.service.http.security import secured
@@ -210,6 +224,9 @@ class HttpServer:
         @asynccontextmanager
         async def lifespan(app: FastAPI) -> AsyncIterator[None]:
             self._loop = asyncio.get_running_loop()
+            self._loop.set_exception_handler(_report_briefly)
+            # What the first request would import is loaded now: it may come when no file descriptor is free.
+            await run_in_threadpool(lambda: None)
             self._started.set()
             yield
 
