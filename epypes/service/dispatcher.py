@@ -18,7 +18,7 @@ from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import ServiceError
-from epypes.service.event_states import Delays, EventStates, Series
+from epypes.service.event_states import Delays, EventStates
 from epypes.service.result_publisher import (
     Provenance,
     Result,
@@ -69,9 +69,8 @@ class AcceptedEvent:
         Whether a worker died while it had this event: then it is tried alone.
     result
         What is published; None until it is resolved.
-    series, state
-        Where the bundle has state between events: the series that it belongs to, and the encoded state that it began
-        with, empty for the initial one.
+    state
+        The encoded state between events that it began with; empty for the initial one, and for a bundle without.
     """
 
     seq: int
@@ -83,7 +82,6 @@ class AcceptedEvent:
     deaths: int = 0
     is_suspect: bool = False
     result: Result | None = None
-    series: Series | None = None
     state: bytes = b""
 
     @property

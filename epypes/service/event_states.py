@@ -110,7 +110,7 @@ class EventStates:
         key = self.key_of(event)
         series = self._series.setdefault(key, Series())
         self._series.move_to_end(key)
-        event.series, event.state, series.last_seq = series, series.block, event.seq
+        event.state, series.last_seq = series.block, event.seq
         self._make_room(running)
         content: dict[str, Any] = {"key": key, "state": "held"}
         frames = list(event.delivery.frames)
@@ -128,9 +128,8 @@ class EventStates:
 
     def note(self, event: AcceptedEvent, message: WorkerMessage, running: Iterable[AcceptedEvent]) -> None:
         """Keep what an event has left by a worker's ``done`` message; a failed one leaves the state as it was."""
-        key = self.key_of(event)
-        series = self._series.get(key)
-        if series is None or series is not event.series:
+        series = self._series.get(self.key_of(event))
+        if series is None:
             # The state was reset while the event was in flight.
             return
         if not message.content.get("has_state"):
