@@ -14,11 +14,11 @@ from epypes.cli.failures import failures, replay
 from epypes.cli.lab import lab
 from epypes.cli.machine import doctor, export, keys
 from epypes.cli.recordings import play, record
-from epypes.cli.services import deploy, rollback, serve, set_parameters, stop
+from epypes.cli.services import deploy, reset, rollback, serve, set_parameters, stop
 from epypes.cli.status import status
 
 _COMMANDS = (
-    *(promote, verify, check, serve, call, status, set_parameters, stop, deploy, rollback, failures, replay),
+    *(promote, verify, check, serve, call, status, set_parameters, reset, stop, deploy, rollback, failures, replay),
     *(record, play, keys, doctor, export, lab, demo, experiment),
 )
 app = click.Group(

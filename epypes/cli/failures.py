@@ -123,7 +123,7 @@ def replay(failure: str, source: str | None, bundle: Path | None, timeout_s: flo
     folder, changed = bundle_of(record, bundle or path_of(source))
     if changed:
         click.echo(f"{changed}.")
-    found = reproduce(record, event, folder, timeout_s=timeout_s)
+    found = reproduce(record, event, folder, store.state(record.id), timeout_s=timeout_s)
     if trace:
         click.echo("\n".join(found.trace))
     click.echo(f"{record.id} {_describe_replay(record, found)}")

@@ -33,6 +33,7 @@ from epypes.cli.options import (
 from epypes.errors import KeysError, ServiceError
 
 if TYPE_CHECKING:
+    from epypes.service.event_states import StateChoice
     from epypes.service.remote.connection import Connection
     from epypes.service.state_file import ServiceState
 
@@ -47,6 +48,13 @@ _service_option: Final = click.option(
     help="URL of the service, as http://127.0.0.1:8642, or the bundle that it was started with.",
 )
 
+
+_state_option: Final = click.option(
+    "--state",
+    type=click.Choice(["keep", "reset"]),
+    show_default="keep if both bundles delay the same tokens",
+    help="What becomes of the state between events.",
+)
 
 # -- which service a command is about ---------------------------------------------------------------------------------
 
@@ -132,6 +140,13 @@ def describe_failures(address: str, is_shown: bool) -> str:
 @click.option("--token-file", type=PATH, help="File with the token of the HTTP control; default: a new one.")
 @click.option("--store", help="SQLite file (extra store) or database URL (extra postgres), for a row per event.")
 @click.option("--replica", default="", show_default="a number", help="Name among the replicas that share a queue.")
+@click.option(
+    "--state-per",
+    type=click.Choice(["one", "source"]),
+    default="one",
+    help="State between events: one for all, or one for each source of events.",
+)
+@click.option("--partitioned", is_flag=True, help="The broker delivers all events of one source to one replica.")
 def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **options: Any) -> None:
     """Serve a bundle until SIGTERM or Ctrl+C.
 
@@ -257,10 +272,39 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
 
 
 @click.command()
+@source_argument
+@click.option("--source", "event_source", help="Source of events whose state alone is reset.", show_default="all")
+@token_file_option
+@replica_option
+def reset(source: str, event_source: str | None, token_file: Path | None, replica: str) -> None:
+    """Reset the state between events of a running service.
+
+    The next event begins with the initial values of the delays, as the first one did. Stopping a service resets its
+    state too; a worker that dies does not.
+    """
+    # Of several replicas each has the states of the sources whose events it gets.
+    urls = [] if is_url(source) else [state.http for state in states_of(source, replica) if state.http]
+    refusals = []
+    for url in urls or [source]:
+        try:
+            with connect_to(url, token_file, replica) as service:
+                service.reset(event_source)
+        except ServiceError as error:
+            refusals.append(error)
+    if len(refusals) == max(len(urls), 1):
+        raise refusals[0]
+    for refusal in refusals:
+        click.echo(f"{refusal}", err=True)
+    of = "" if event_source is None else f" of source {event_source}"
+    click.echo(f"RESET the state between events{of}.")
+
+
+@click.command()
 @click.argument("bundle", type=PATH, help="Folder of the bundle, on the service's machine.")
 @_service_option
+@_state_option
 @token_file_option
-def deploy(bundle: Path, source: str, token_file: Path | None) -> None:
+def deploy(bundle: Path, source: str, state: StateChoice | None, token_file: Path | None) -> None:
     """Deploy another bundle to a running service.
 
     The service replays the bundle first; if it computes something else, the service keeps the old one.
@@ -268,19 +312,20 @@ def deploy(bundle: Path, source: str, token_file: Path | None) -> None:
     with connect_to(source, token_file) as connection:
         before = connection.info()
         click.echo(f"{bundle} is replayed beside {before['bundle']}, which goes on meanwhile.", err=True)
-        _print_exchange("DEPLOYED", before, connection.deploy(bundle))
+        _print_exchange("DEPLOYED", before, connection.deploy(bundle, state))
 
 
 @click.command()
 @_service_option
+@_state_option
 @token_file_option
-def rollback(source: str, token_file: Path | None) -> None:
+def rollback(source: str, state: StateChoice | None, token_file: Path | None) -> None:
     """Return a running service to its previous bundle.
 
     A second rollback returns to the bundle before the first.
     """
     with connect_to(source, token_file) as connection:
-        _print_exchange("ROLLED BACK", connection.info(), connection.rollback())
+        _print_exchange("ROLLED BACK", connection.info(), connection.rollback(state))
 
 
 def _print_exchange(verb: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:

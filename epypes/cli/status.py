@@ -12,6 +12,7 @@ import click
 from epypes.cli.options import json_option, replica_option, source_argument
 from epypes.cli.services import DIGITS, connect_to, describe_bundle, describe_failures, is_url, states_of
 from epypes.errors import EpypesError
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     from epypes.service.state_file import ServiceState
@@ -117,9 +118,18 @@ def _print_parameters_and_addresses(service: Info) -> None:
     if service.get("parameters"):
         values = ", ".join(f"{token}={json.dumps(value)}" for token, value in service["parameters"].items())
         click.echo(f"Parameters, revision {service['revision']}: {values}")
+    if service.get("states"):
+        _print_states(service["states"])
     at = service["addresses"]
     failures = describe_failures(at["failures"], service.get("shows_failures", True))
     click.echo(f"Events at {at['sub']}, answers at {at['pub']}{failures}.")
+
+
+def _print_states(states: dict[str, Any]) -> None:
+    tokens = ", ".join(f"{key} of {token}" for key, token in states["tokens"].items())
+    forgotten = f", {states['forgotten']} forgotten" if states["forgotten"] else ""
+    sources = counted(states["count"], "source") if states["per"] == "source" else "one for all events"
+    click.echo(f"State between events: {tokens}; {sources}, {states['bytes']:,} bytes{forgotten}.")
 
 
 # -- replicas that share the events of a broker -----------------------------------------------------------------------

@@ -12,6 +12,7 @@ from epypes.bundle.manifest import check_manifest
 from epypes.errors import BundleError, DeployRefused, ServiceError
 from epypes.service.bundle_info import BundleInfo, differing_ports, read_bundle_info
 from epypes.service.dispatcher import Dispatcher
+from epypes.service.event_states import Delays, StateChoice, change_of_state
 from epypes.service.parameters import ParameterControl, differing_values
 from epypes.service.sd_notify import notify, notify_reloading
 from epypes.service.supervisor import Supervisor
@@ -41,6 +42,8 @@ class Deployer:
         How long an event may take: the switch waits for it.
     notify_listeners
         Called with ``"deployed"`` and what is served now.
+    why_refused
+        Returns why a bundle can't be served with the options of the service; empty if it can.
     """
 
     def __init__(
@@ -50,26 +53,33 @@ class Deployer:
         parameters: ParameterControl,
         job_timeout_s: float,
         notify_listeners: Callable[[str, dict[str, Any]], None],
+        why_refused: Callable[[BundleInfo], str],
     ) -> None:
-        self._notify_listeners = notify_listeners
+        self._notify_listeners, self._why_refused = notify_listeners, why_refused
         self._dispatcher, self._supervisor, self._parameters = dispatcher, supervisor, parameters
         self._timeout_s = job_timeout_s + _GRACE_S
         self._lock = threading.Lock()
         self._before: BundleInfo | None = None
 
-    def deploy(self, path: str | Path) -> list[str]:
+    def deploy(self, path: str | Path, state: StateChoice | None = None) -> list[str]:
         """Serve another bundle from now on, with its own parameters; return a line for each value that changed.
+
+        Parameters
+        ----------
+        state
+            What becomes of the state between events. Without, it is kept if both bundles have the same delays.
 
         Raises
         ------
         DeployRefused
-            It does not compute what was recorded, or has other ports; the bundle that is served goes on.
+            It does not compute what was recorded, or has other ports, or can't keep the state; the bundle that is
+            served goes on.
         ServiceError
             A deploy, a rollback or a write-back is running already.
         """
-        return self._exclusive(path, lambda: self._deploy(_read(path), "deployed"))
+        return self._exclusive(path, lambda: self._deploy(_read(path), "deployed", state))
 
-    def rollback(self) -> list[str]:
+    def rollback(self, state: StateChoice | None = None) -> list[str]:
         """Serve the bundle again that was served before; return a line for each value that changed.
 
         The bundle that is served now is the one before then, so a second rollback undoes the first.
@@ -80,7 +90,7 @@ class Deployer:
             There was none, or it was changed since.
         """
         path = self._supervisor.bundle.path
-        return self._exclusive(path, lambda: self._deploy(self._read_before(), "rolled back to"))
+        return self._exclusive(path, lambda: self._deploy(self._read_before(), "rolled back to", state))
 
     def write_back(self, *, dry_run: bool) -> WriteBack:
         """Write the parameters into the bundle that is served, whose new digest is the one that is served then.
@@ -153,24 +163,28 @@ class Deployer:
             raise DeployRefused(before.path, [why])
         return found
 
-    def _deploy(self, bundle: BundleInfo, how: str) -> list[str]:
+    def _deploy(self, bundle: BundleInfo, how: str, state: StateChoice | None) -> list[str]:
         now = self._supervisor.bundle
-        reasons = differing_ports(now.settings, bundle.settings)
+        reasons = [*differing_ports(now.settings, bundle.settings), *filter(None, [self._why_refused(bundle)])]
         if reasons:
             raise DeployRefused(bundle.path, reasons)
         try:
             connection = self._supervisor.load(bundle)
         except ServiceError as error:
             raise DeployRefused(bundle.path, [str(error)]) from error
+        is_kept, line = change_of_state(self._dispatcher.delays, _delays(connection), state)
+        if state == "keep" and not is_kept:
+            connection.dismiss(0.0)
+            raise DeployRefused(bundle.path, [f"It can't go on with the {line}. Deploy it with the state reset."])
         self._dispatcher.hold(_HOLD)
         try:
-            values = self._switch(connection, how)
+            values = self._switch(connection, how, state)
         finally:
             self._dispatcher.release(_HOLD)
         self._before = now
         return values
 
-    def _switch(self, connection: WorkerConnection, how: str) -> list[str]:
+    def _switch(self, connection: WorkerConnection, how: str, state: StateChoice | None) -> list[str]:
         """Let the worker of the other bundle take over when no event is worked on; return the changed values."""
         with self._dispatcher.lock:
             ended = self._dispatcher.wait_for(lambda: not self._dispatcher.running, self._timeout_s)
@@ -179,14 +193,22 @@ class Deployer:
                 tuned = self._parameters.current.entries
                 self._parameters.take_over(connection.bundle)
                 values = differing_values(before.entries, tuned, self._parameters.current.entries)
+                is_kept, line = change_of_state(self._dispatcher.delays, _delays(connection), state)
+                if not is_kept:
+                    self._dispatcher.reset_state()
                 self._supervisor.switch(connection)
                 self._publish_deployed(how, before)
-                return values
+                return values + [line] * bool(line)
         why = f"The event that is worked on has not ended within {self._timeout_s:g} s."
         if ended:
             why = connection.process.ending or "The service stops."
         connection.dismiss(0.0)
         raise DeployRefused(connection.bundle.path, [why])
+
+
+def _delays(connection: WorkerConnection) -> Delays:
+    delays: Delays = connection.about.get("delays", {})
+    return delays
 
 
 def _short(bundle: BundleInfo) -> str:

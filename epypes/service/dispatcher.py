@@ -15,9 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter_ns
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import ServiceError
+from epypes.service.event_states import Delays, EventStates
 from epypes.service.result_publisher import (
     Provenance,
     Result,
@@ -68,6 +69,8 @@ class AcceptedEvent:
         Whether a worker died while it had this event: then it is tried alone.
     result
         What is published; None until it is resolved.
+    state
+        The encoded state between events that it began with; empty for the initial one, and for a bundle without.
     """
 
     seq: int
@@ -79,6 +82,7 @@ class AcceptedEvent:
     deaths: int = 0
     is_suspect: bool = False
     result: Result | None = None
+    state: bytes = b""
 
     @property
     def stored(self) -> EncodedEnvelope | bytes:
@@ -130,6 +134,9 @@ class Dispatcher:
         # Events that were given to a worker at least once, in the order of acceptance, until they are released.
         self._begun: dict[int, AcceptedEvent] = {}
         self._unconfirmed: dict[int, AcceptedEvent] = {}
+        # None for a bundle without state between events.
+        self._states: EventStates | None = None
+        self._state_per = options.state_per
         self._to_publish: deque[Callable[[], object]] = deque()
         self._publishing, self._publishing_thread = threading.Lock(), 0
 
@@ -202,6 +209,12 @@ class Dispatcher:
         """Give events to this worker from now on; without one, they wait."""
         with self.lock:
             self._connection = connection
+            if connection is not None:
+                delays = connection.about.get("delays")
+                if not delays:
+                    self._states = None
+                elif self._states is None or self._states.delays != delays:
+                    self._states = EventStates(delays, self._state_per)
             self._flow()
 
     def hold(self, reason: str) -> None:
@@ -240,7 +253,10 @@ class Dispatcher:
             event.started_ns = perf_counter_ns()
             self._running[event.seq] = self._begun[event.seq] = event
             try:
-                connection.post_event(event.seq, event.delivery.frames)
+                if self._states is None:
+                    connection.post_event(event.seq, event.delivery.frames)
+                else:
+                    self._states.post(event, connection, self._running.values())
             except MemoryError as error:
                 self._resolve(event, failed_result(event, error, self._provenance(), "raised"))
         if self._has_broker and self._has_room():
@@ -259,7 +275,34 @@ class Dispatcher:
         is_ahead = len(self._begun) - len(running) >= _MAX_AHEAD * self._slots
         if not self._waiting or is_ahead or len(self._unconfirmed) >= _MAX_UNCONFIRMED:
             return None
-        return self._waiting.popleft()
+        if self._states is None:
+            return self._waiting.popleft()
+        return self._states.take_next(self._waiting, running.values())
+
+    # -- state between events -----------------------------------------------------------------------------------------
+
+    @property
+    def delays(self) -> Delays:
+        """Of the bundle whose states are kept; empty for one without."""
+        return {} if self._states is None else self._states.delays
+
+    def describe_states(self) -> dict[str, Any] | None:
+        """Return what there is of state between events, JSON-ready; None without any."""
+        with self.lock:
+            return None if self._states is None else self._states.describe()
+
+    def reset_state(self, source: str | None = None) -> int:
+        """Have the next event of each series, or of one source's, begin with the initial state; return how many.
+
+        Raises
+        ------
+        UnknownName
+            There is no state of this source.
+        ServiceError
+            All sources have one state.
+        """
+        with self.lock:
+            return 0 if self._states is None else self._states.reset(source)
 
     # -- from the worker ----------------------------------------------------------------------------------------------
 
@@ -269,6 +312,8 @@ class Dispatcher:
             event = self._running.get(message.number) if connection is self._connection else None
             if event is None:
                 return
+            if self._states is not None:
+                self._states.note(event, message, self._running.values())
             self._resolve(event, worker_result(event, message, self._provenance))
             self.answered_in_row += 1
             self._assign()

@@ -92,11 +92,14 @@ class Membership:
         for each in newly_lost:
             _log.warning("%s is gone: no heartbeat for %.1f s", label(each.heartbeat), now_s - each.heard_s)
 
+    def present(self) -> list[Heartbeat]:
+        """Return the last heartbeats of the others that are alive."""
+        with self._lock:
+            return [each.heartbeat for each in self._members.values() if not each.is_lost]
+
     def serving(self, digest: str) -> list[Heartbeat]:
         """Return the last heartbeats of the others that serve a bundle."""
-        with self._lock:
-            found = [each.heartbeat for each in self._members.values() if not each.is_lost]
-        return [heartbeat for heartbeat in found if heartbeat.digest == digest]
+        return [heartbeat for heartbeat in self.present() if heartbeat.digest == digest]
 
     def describe(self, own: Heartbeat) -> dict[str, Any]:
         """Return the fields of `Replicas.describe` that are about members, this replica among them."""

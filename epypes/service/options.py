@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from epypes.errors import ServiceError
+from epypes.service.event_states import StatePer
 from epypes.transport.address import Address, is_broker, parse_address
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 MailboxPolicy = Literal["latest", "drop_oldest", "fault"]
 POLICIES: Final = get_args(MailboxPolicy)
+STATES_PER: Final = get_args(StatePer)
 ANY_PORT: Final = "tcp://127.0.0.1:*"
 MAX_THREADS: Final = 64
 
@@ -31,7 +33,8 @@ class Options:
         ``failure``: an address is bound, ``connect:ADDRESS`` is connected to. ``tcp://127.0.0.1:*`` takes any free
         port. Or the address of a broker, as ``amqp://HOST/QUEUE``.
     threads
-        How many events are worked on at once; answers keep the order of the events.
+        How many events are worked on at once; answers keep the order of the events, with a state per source that of the
+        events of each source.
     job_timeout_s
         How long an event may take, in seconds. An event that takes longer has failed, and the worker is replaced.
     retries
@@ -47,6 +50,10 @@ class Options:
         Where a row of each event is kept: a SQLite file or a database's URL. Nothing waits for it.
     replica
         Name among the services of the bundle that share the events of a broker.
+    state_per
+        Of a bundle with state between events: ``"one"`` state for all events, or one for each ``"source"`` of them.
+    partitioned
+        Whether the broker delivers all events of one source to one replica, so that replicas may have state.
     """
 
     sub: str = ANY_PORT
@@ -63,6 +70,8 @@ class Options:
     allow: PublicKey | Collection[PublicKey] | None = None
     store: str | Path | None = None
     replica: str = ""
+    state_per: StatePer = "one"
+    partitioned: bool = False
 
     @property
     def has_broker(self) -> bool:
@@ -116,6 +125,12 @@ class Options:
         if self.has_broker and self.mailbox_policy != "drop_oldest":
             text = f"A broker keeps what waits, so mailbox {self.mailbox_policy!r} drops nothing. Leave that out."
             raise ServiceError(path, text)
+        if self.state_per not in STATES_PER:
+            known = " or ".join(map(repr, STATES_PER))
+            raise ServiceError(self.state_per, f"State is kept per {known}, not per {self.state_per!r:.80}.")
+        if self.partitioned and not (self.has_broker and self.state_per == "source"):
+            text = "Events are partitioned by source where a broker delivers them, and each source has a state:"
+            raise ServiceError(path, f"{text} with --state-per source, and --sub amqp://, nats:// or mqtt://.")
         # ZeroMQ would show an address that it does not know, with the password in it.
         addresses = [parse_address(each) for each in (self.sub, self.pub, self.failures)]
         if self.has_broker and any(_is_same(addresses[0], place) for place in addresses[1:]):

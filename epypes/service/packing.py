@@ -7,9 +7,9 @@ checks the table first, so nothing is allocated for what a broken or hostile blo
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import accumulate, pairwise
-from typing import Final
+from typing import Any, Final
 
 from epypes.errors import MessageError
 from epypes.wire import EncodedEnvelope, Envelope
@@ -27,6 +27,8 @@ _MAX_BYTES: Final = DEFAULT_LIMITS.total_bytes
 # The first byte of an event in one block.
 _ENVELOPE: Final = b"v"
 _RAW: Final = b"r"
+# The type of an Envelope that has a state.
+_STATE: Final = "epypes.state"
 
 
 def pack(frames: Sequence[BytesLike]) -> bytes:
@@ -126,3 +128,29 @@ def unpack_event(data: BytesLike) -> Envelope | bytes:
 
         return decode(unpack(block[1:]))
     raise MessageError("no event", f"An event in one block begins with {_ENVELOPE!r} or {_RAW!r}, not with {kind!r}.")
+
+
+def pack_state(state: Mapping[str, Any]) -> bytes:
+    """Return a state between events, values by key, as one block.
+
+    Raises
+    ------
+    MessageError
+        A value has no codec, or is too large.
+    """
+    from epypes.wire import encode
+
+    return pack(encode(Envelope(_STATE, state, id="")))
+
+
+def unpack_state(data: BytesLike) -> Mapping[str, Any]:
+    """Return the state of a block of `pack_state`; arrays are read-only views of it.
+
+    Raises
+    ------
+    MessageError
+        For anything else, and nothing else.
+    """
+    from epypes.wire import decode
+
+    return decode(unpack(data)).parts

@@ -49,6 +49,8 @@ _JOIN_TIMEOUT_S: Final = 5.0
 _RETRY_S: Final = 0.25
 _CLOSE_S: Final = 1.0
 _MAX_BUNDLES: Final = 100
+# In these states a replica takes no events.
+_TAKES_NONE: Final = ("DRAINING", "FAULTED", "STOPPED")
 # Longer texts are cut: a heartbeat is small.
 _MAX_TEXT: Final = 500
 
@@ -444,6 +446,10 @@ class Replicas:
             key: value[:_MAX_TEXT] if isinstance(value, str) else value for key, value in about.items()
         }
         return Heartbeat(**cut)
+
+    def others(self) -> list[str]:
+        """Return names of the other replicas that take events from the queue, as far as they are known."""
+        return [label(each) for each in self._membership.present() if each.state not in _TAKES_NONE]
 
     def describe(self) -> dict[str, Any]:
         """Return the group as this replica knows it, JSON-ready.

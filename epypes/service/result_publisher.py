@@ -403,7 +403,8 @@ class ResultPublisher:
     def _report_failure(self, event: AcceptedEvent, result: Result, failure: FailedEvent) -> FailedEvent:
         self._log_failure(failure)
         # In a storm dropped events would fill the store's memory with images of no interest.
-        kept = self._store.keep(failure, None if failure.kind == "dropped" else event.stored)
+        stored = None if failure.kind == "dropped" else event.stored
+        kept = self._store.keep(failure, stored, event.state)
         # With its id, by which a receiver can run it again.
         more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
         for answer in result.answers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import threading
@@ -10,10 +11,12 @@ from pathlib import Path
 from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from epypes.service.bundle_info import read_bundle_info
+from epypes.errors import ServiceError
+from epypes.service.bundle_info import BundleInfo, read_bundle_info
 from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import AnswerOutput, Endpoints, EventInput, group_address
+from epypes.service.event_states import StateChoice, why_refused
 from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
@@ -34,6 +37,8 @@ if TYPE_CHECKING:
 _DRAIN_SHARE: Final = 0.7
 _CHANGE_TIMEOUT_S: Final = 10.0
 _JOINING: Final = "joining the replicas"
+
+_log = logging.getLogger("epypes.service")
 
 
 class Service:
@@ -58,13 +63,16 @@ class Service:
     AddressError
         An address is not on loopback.
     ServiceError, StoreError
-        The mailbox, a time-out or the number of threads is invalid; or the database can't be used.
+        The mailbox, a time-out or the number of threads is invalid, or the bundle has state between events, which these
+        options would mix up; or the database can't be used.
     """
 
     def __init__(self, path: str | Path, sub: str = ANY_PORT, pub: str = ANY_PORT, **options: Any) -> None:
         self.options = given = Options(sub, pub, **options)
         given.check(path)
         bundle = read_bundle_info(path)
+        if reason := why_refused(bundle.settings.states, given):
+            raise ServiceError(bundle.path, reason)
         self.path, self.threads = bundle.path, given.threads
         self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
         self.http = self.token_file = ""
@@ -84,14 +92,14 @@ class Service:
         )
         self._queries = WorkerQueries(lambda: self._supervisor.bundle, lambda: self._dispatcher.connection)
         self._deployer = Deployer(
-            self._dispatcher, self._supervisor, self._parameters, given.job_timeout_s, self._results.notify
-        )
-        self._replicas = Replicas(
-            group_address(given),
-            self._facts,
+            self._dispatcher,
+            self._supervisor,
             self._parameters,
-            lambda: self._dispatcher.release(_JOINING),
+            given.job_timeout_s,
+            self._results.notify,
+            self._why_refused,
         )
+        self._replicas = Replicas(group_address(given), self._facts, self._parameters, self._joined)
         self._parameters.newest = self._replicas.newest
         self._started_ns = 0
         self._lock = threading.Lock()
@@ -115,6 +123,7 @@ class Service:
                 self._lifecycle.is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
+                self._dispatcher.reset_state()
                 if self._replicas.is_shared:
                     # Until the parameters of the other replicas are known.
                     self._dispatcher.hold(_JOINING)
@@ -260,6 +269,7 @@ class Service:
             "started_ns": self._started_ns,
             "restarts": self._supervisor.health.restarts,
             "counts": self.counts(),
+            "states": self._dispatcher.describe_states(),
         }
 
     def listen(self, callback: Listener) -> Callable[[], None]:
@@ -288,6 +298,18 @@ class Service:
         bundle, current = self._supervisor.bundle, self._parameters.current
         return Provenance(bundle.settings.name, str(bundle.path), bundle.digest, current.revision, current.entries)
 
+    def _why_refused(self, bundle: BundleInfo) -> str:
+        """Return why a bundle can't be served with these options, and beside these replicas; empty if it can."""
+        return why_refused(bundle.settings.states, self.options, self._replicas.others())
+
+    def _joined(self) -> None:
+        """Work on events, now that the other replicas are known; unless the bundle can't be served beside them."""
+        with self._dispatcher.lock:
+            if reason := self._why_refused(self._supervisor.bundle):
+                self._supervisor.refuse(reason)
+        self._dispatcher.release(_JOINING)
+        self._dispatcher.publish()
+
     # -- operation ----------------------------------------------------------------------------------------------------
 
     def pause(self) -> None:
@@ -311,23 +333,32 @@ class Service:
             self._lifecycle.leave(timeout_s)
         return is_done
 
-    def deploy(self, path: str | Path) -> dict[str, Any]:
+    def deploy(self, path: str | Path, state: StateChoice | None = None) -> dict[str, Any]:
         """Serve another bundle from now on; return `info`, and which values changed.
 
         A second worker proves it beside the first one, and gets the events when none is worked on. It has its own
         parameters, with the next revision: ``changed`` has a line for each value that differs, as
-        ``"sigma 1.4 -> 1.0 (tuned, not written back)"``.
+        ``"sigma 1.4 -> 1.0 (tuned, not written back)"``, and one that says whether the state between events is kept.
+
+        Parameters
+        ----------
+        path
+            The bundle.
+        state
+            Whether to ``"keep"`` or ``"reset"`` the state between events. Without, it is kept if both bundles delay the
+            same tokens with the same initial values.
 
         Raises
         ------
         DeployRefused
-            It does not compute what was recorded, or has other ports; the bundle that is served goes on.
+            It does not compute what was recorded, or has other ports, or can't keep the state; the bundle that is
+            served goes on.
         ServiceError
             A deploy, a rollback or a write-back is running already.
         """
-        return {"changed": self._deployer.deploy(path), **self.info()}
+        return {"changed": self._deployer.deploy(path, state), **self.info()}
 
-    def rollback(self) -> dict[str, Any]:
+    def rollback(self, state: StateChoice | None = None) -> dict[str, Any]:
         """Serve the bundle again that was served before; return what `deploy` returns.
 
         The bundle that is left is the one before then, so a second rollback undoes the first.
@@ -337,7 +368,29 @@ class Service:
         DeployRefused
             There was none, or it was changed since.
         """
-        return {"changed": self._deployer.rollback(), **self.info()}
+        return {"changed": self._deployer.rollback(state), **self.info()}
+
+    def reset(self, source: str | None = None) -> int:
+        """Have the next event begin with the initial state, as if it were the first; return how many states were reset.
+
+        Parameters
+        ----------
+        source
+            Whose state; every state without.
+
+        Raises
+        ------
+        UnknownName
+            There is no state of this source.
+        ServiceError
+            The bundle has no state between events; or all sources have one.
+        """
+        if not self._supervisor.bundle.settings.states:
+            text = "There is nothing to reset: no bundle with state between events (ep.delay) is served."
+            raise ServiceError(self._supervisor.bundle.path, text)
+        count = self._dispatcher.reset_state(source)
+        _log.info("the state %s is reset", "between events" if source is None else f"of source {source!r:.80}")
+        return count
 
     # -- its parameters ---------------------------------------------------------------------------------------------
 

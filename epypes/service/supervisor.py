@@ -287,6 +287,12 @@ class Supervisor:
         self._changed.notify_all()
         self._on_change()
 
+    def refuse(self, why: str) -> None:
+        """End the worker, and start none any more: the bundle can't be served any longer. With the lock held."""
+        if self.worker is not None:
+            self.worker.kill()
+        self._fault(why)
+
     def _fault(self, why: str) -> None:
         """Start no worker any more: what is wrong does not pass by itself. With the lock held."""
         if self._is_ending:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("epypes.service")
 
+_NO_CONTENT: Final[Mapping[str, Any]] = {}
 WorkerStatus = Literal["loading", "ready", "refused", "gone"]
 
 # How long a query may take.
@@ -320,9 +321,9 @@ class WorkerConnection:
 
     # -- sending ------------------------------------------------------------------------------------------------------
 
-    def post_event(self, seq: int, frames: Sequence[BytesLike]) -> None:
+    def post_event(self, seq: int, frames: Sequence[BytesLike], content: Mapping[str, Any] = _NO_CONTENT) -> None:
         """Give the worker an event; returns at once."""
-        self._post(WorkerMessage("event", seq, frames=frames))
+        self._post(WorkerMessage("event", seq, content, frames))
 
     def post_parameters(self, revision: int, values: Mapping[str, Any], number: int | None = None) -> None:
         """Have it take values of hyperparameters as soon as it works on no event; a message reports whether it has."""

@@ -66,6 +66,10 @@ ROWS = {
         (["{bundle}", "--service", "{bundle}"], "No service of yours runs for {bundle}."),
     ],
     "rollback": [(["--http", "nonsense"], "nonsense does not exist. Name the bundle that is served, or its http URL.")],
+    "reset": [
+        (["{bundle}"], "No service of yours runs for {bundle}."),
+        (["http://127.0.0.1:9", "--source", "left"], "No service answers at http://127.0.0.1:9. Start one: "),
+    ],
     "status": [
         (["{folder}/none"], "{folder}/none does not exist. Name the bundle that is served"),
         (["{bundle}"], "No service of yours runs for {bundle}. Start it: epypes serve {bundle}"),

@@ -14,8 +14,11 @@ def toml(value):
     return repr(value) if not isinstance(value, str) else f'"{value}"'
 
 
-def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sample, own=()):
-    """Write a bundle whose module is this source; ``sample`` is the inputs and outputs of one run."""
+def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sample, own=(), states=(), state=({}, {})):
+    """Write a bundle whose module is this source; ``sample`` is the inputs and outputs of one run.
+
+    ``states`` are those of the settings, and ``state`` is what the run began with and left.
+    """
     (folder / "samples").mkdir(parents=True)
     (folder / "pipeline.py").write_text(textwrap.dedent(source))
     settings = [
@@ -28,10 +31,12 @@ def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sampl
     ]
     if own:
         settings.append(f"own = {list(own)!r}".replace("'", '"'))
+    if states:
+        settings += ["[states]", *(f'"{key}" = "{token}"' for key, token in dict(states).items())]
     for token, value in dict(hyperparameters).items():
         settings += [f"[hyperparameters.{token}]", f"value = {toml(value)}"]
     (folder / "pipeline.toml").write_text("\n".join(settings) + "\n")
     (folder / "requirements.txt").write_text("")
-    save_sample(folder / "samples" / "run_1.npz", *sample)
+    save_sample(folder / "samples" / "run_1.npz", *sample, state=state[0], state_after=state[1])
     write_manifest(folder)
     return folder

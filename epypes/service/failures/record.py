@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from epypes.bundle.arrays import StoredArray
 from epypes.bundle.settings import decode_value
+from epypes.service.packing import unpack_state
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"
@@ -61,6 +62,8 @@ class FailedEvent:
         Whether the event was kept.
     no_event
         Why it was not.
+    state_bytes
+        Size of the state that it began with, which was kept with it; 0 for the initial state, and without state.
     """
 
     id: str = ""
@@ -80,6 +83,7 @@ class FailedEvent:
     hyperparameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     has_event: bool = False
     no_event: str = ""
+    state_bytes: int = 0
 
     @property
     def cause(self) -> tuple[str, str, str]:
@@ -173,6 +177,22 @@ def values_of(
         else:
             gone.append(token)
     return values, f"{', '.join(map(repr, gone))} can't have the value that failed" if gone else ""
+
+
+def state_of(block: bytes, known: Collection[str]) -> tuple[dict[str, Any], str]:
+    """Return the state between events that an event began with, and a note on what the bundle can't go on with.
+
+    Parameters
+    ----------
+    block
+        As it was packed; empty for the initial state.
+    known
+        The keys of the state of the bundle as it is now.
+    """
+    state = unpack_state(block) if block else {}
+    gone = [key for key in state if key not in known]
+    values = {key: value for key, value in state.items() if key in known}
+    return values, f"the state of {', '.join(map(repr, gone))} has no place in the bundle any more" if gone else ""
 
 
 _EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailedEvent(), each.name) for each in fields(FailedEvent)}

@@ -13,7 +13,7 @@ from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.errors import RemoteFailure
 from epypes.run import CompGraphRunner
 from epypes.run.runner import stop_at
-from epypes.service.failures.record import FailedEvent, values_of
+from epypes.service.failures.record import FailedEvent, state_of, values_of
 from epypes.service.failures.reproduce import reproduce
 from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of
 
@@ -24,8 +24,9 @@ _NOT_CALLED: Final = ("killed", "stuck", "exhausted")
 def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = None) -> CompGraphRunner:  # noqa: A002
     """Return a runner whose last run is the one that failed in a service, stopped at the function that failed.
 
-    The event is run again here: with the bundle's f_in, the hyperparameters of that time, and all functions up to the
-    one that failed. A function that killed the worker or never returned is not called; ``rerun`` would call it.
+    The event is run again here: with the bundle's f_in, the hyperparameters and the state between events of that time,
+    and all functions up to the one that failed. A function that killed the worker or never returned is not called;
+    ``rerun`` would call it.
 
     Parameters
     ----------
@@ -64,14 +65,18 @@ def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = Non
     """
     failures = failures_of(source)
     record = find_failure(failures, id)
-    event = failures.event(record.id)
+    event, state = failures.event(record.id), failures.state(record.id)
     folder, changed = bundle_of(record, bundle or path_of(source))
     opened = read_bundle(folder)
     runner = CompGraphRunner(opened.cg, opened.settings.hyperparameters)
     values, left_out = values_of(record, runner.hyperparameters, opened.enums)
     runner.set(**values)
-    run = _stop if record.kind in _NOT_CALLED else _run
-    for note in filter(None, [changed, left_out, run(runner, opened, record, event)]):
+    runner.state, no_state = state_of(state, runner.state)
+    if record.kind in _NOT_CALLED:
+        differs = _stop(runner, opened, record, event, state)
+    else:
+        differs = _run(runner, opened, record, event)
+    for note in filter(None, [changed, left_out, no_state, differs]):
         warnings.warn(f"Failure {record.id}: {note}.", stacklevel=2)
     return runner
 
@@ -108,7 +113,7 @@ def _run(runner: CompGraphRunner, bundle: Bundle, record: FailedEvent, event: An
     return ""
 
 
-def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailedEvent, event: Any) -> str:
+def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailedEvent, event: Any, state: bytes) -> str:
     """Run the event up to the function that failed, which is not called; return a note if that is not possible."""
     if record.kind == "exhausted":
         stop_at(runner, _payload(bundle, event))
@@ -116,7 +121,7 @@ def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailedEvent, event: A
         return f"{text}. rerun('token') goes on to a token"
     if record.function not in (*runner.cg.functions, "f_in"):
         # The service could not say where its worker was. Another process, which may be lost, finds out.
-        record = replace(record, function=reproduce(record, event, bundle.path).function)
+        record = replace(record, function=reproduce(record, event, bundle.path, state).function)
     if record.function == "f_in":
         return f"f_in was {record.kind} by this event, so it is not called here, and no function was run"
     payload = _payload(bundle, event)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.manifest import MODULE
 from epypes.errors import BundleError, EpypesError
-from epypes.service.failures.record import FailedEvent, read_record, values_of, with_id
+from epypes.service.failures.record import FailedEvent, read_record, state_of, values_of, with_id
 from epypes.service.worker_connection import signal_name
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 TIMEOUT_S: Final = 30.0
 # To start Python, to import what the bundle imports, and to end.
 _START_AND_END_S: Final = 60.0
-_RECORD, _EVENT, _OUTCOME, _CALLS, _DUMP = "record.json", "event", "outcome.json", "calls", "dump"
+_RECORD, _EVENT, _STATE, _OUTCOME, _CALLS, _DUMP = "record.json", "event", "state", "outcome.json", "calls", "dump"
 # What functions print comes before the lines of a process that ends.
 _MAX_DUMP_BYTES: Final = 256 * 1024
 _DUMP_LINE: Final = re.compile(r'^  File "([^"\n]*)", line (\d+) in (\S+)', re.MULTILINE)
@@ -80,7 +80,12 @@ class Reproduction:
 
 
 def reproduce(
-    record: FailedEvent, event: Envelope | bytes, bundle: str | Path, *, timeout_s: float = TIMEOUT_S
+    record: FailedEvent,
+    event: Envelope | bytes,
+    bundle: str | Path,
+    state: bytes = b"",
+    *,
+    timeout_s: float = TIMEOUT_S,
 ) -> Reproduction:
     """Run an event once more, alone in a new interpreter that sees neither the environment nor the current folder.
 
@@ -90,6 +95,8 @@ def reproduce(
         Its hyperparameters are taken, as far as the bundle has them.
     bundle
         The folder of the bundle.
+    state
+        The packed state between events that it began with; empty for the initial one.
     timeout_s
         How long the event may take, in seconds.
 
@@ -104,6 +111,7 @@ def reproduce(
         scratch = Path(name)
         (scratch / _RECORD).write_text(json.dumps(asdict(with_id(record)), default=str), encoding="utf-8")
         (scratch / _EVENT).write_bytes(pack_event(event))
+        (scratch / _STATE).write_bytes(state)
         folder = Path(bundle).resolve()
         status = _run_process(folder, scratch, timeout_s)
         return _read_result(folder, scratch, status, timeout_s)
@@ -190,6 +198,7 @@ def _pipeline(folder: Path, scratch: Path) -> tuple[FullPipeline, list[Failure]]
     pipeline = pipeline_of(bundle, queue.SimpleQueue(), queue.SimpleQueue())
     record = read_record(json.loads((scratch / _RECORD).read_bytes()))
     pipeline.runner.set(**values_of(record, pipeline.runner.hyperparameters, bundle.enums)[0])
+    pipeline.state = state_of((scratch / _STATE).read_bytes(), pipeline.state)[0]
     failures: list[Failure] = []
     pipeline.on_error = failures.append
     _log_calls(pipeline, scratch / _CALLS)

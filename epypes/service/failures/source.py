@@ -34,6 +34,9 @@ class FailureSource(Protocol):
     def event(self, failure_id: str) -> Envelope | bytes:
         """Return the event that failed; raise UnknownName or FailureNotKept."""
 
+    def state(self, failure_id: str) -> bytes:
+        """Return the packed state between events that it began with; empty for the initial one, and without state."""
+
 
 class _ServiceFailures:
     """The failures of a running service."""
@@ -50,6 +53,9 @@ class _ServiceFailures:
             reason = record.no_event or "the service had none to give"
             raise FailureNotKept(failure_id, "", f"The event of failure {failure_id} was not kept: {reason}.")
         return event
+
+    def state(self, failure_id: str) -> bytes:
+        return self._connection.failure_state(failure_id)
 
 
 class _LocalFailures:
@@ -77,9 +83,15 @@ class _LocalFailures:
         return sorted(found, key=lambda record: record.id, reverse=True)[:limit]
 
     def event(self, failure_id: str) -> Envelope | bytes:
+        return self._store(failure_id).event(failure_id)
+
+    def state(self, failure_id: str) -> bytes:
+        return self._store(failure_id).state(failure_id)
+
+    def _store(self, failure_id: str) -> FailureStore:
         for store in self._stores:
             if any(record.id == failure_id for record in store.records()):
-                return store.event(failure_id)
+                return store
         raise UnknownName("failure", failure_id, [record.id for record in self.records()], "on this machine")
 
 

@@ -121,14 +121,23 @@ class FailureStore:
 
     # -- keeping ------------------------------------------------------------------------------------------------
 
-    def keep(self, record: FailedEvent, event: Envelope | EncodedEnvelope | bytes | None = None) -> FailedEvent:
+    def keep(
+        self, record: FailedEvent, event: Envelope | EncodedEnvelope | bytes | None = None, state: bytes = b""
+    ) -> FailedEvent:
         """Keep a failure; return its record with the id that it has got.
 
         Returns at once and raises nothing. The event's arrays must not change any more.
+
+        Parameters
+        ----------
+        event
+            What failed.
+        state
+            The encoded state between events that it began with; empty for the initial one.
         """
         record = with_id(record)
         with self._lock:
-            is_put = self._budgets.spend(record.cause, lambda: self._writer.put((record, event)))
+            is_put = self._budgets.spend(record.cause, lambda: self._writer.put((record, event, state)))
             self._counts["skipped"] += not is_put
         return record
 
@@ -151,15 +160,15 @@ class FailureStore:
 
     # on the writer's thread, to the end of this section
 
-    def _write_next(self, items: list[tuple[FailedEvent, Any]]) -> bool:
+    def _write_next(self, items: list[tuple[FailedEvent, Any, bytes]]) -> bool:
         self._sweep()
-        for record, event in items:
-            self._write(record, event)
+        for record, event, state in items:
+            self._write(record, event, state)
         return True
 
-    def _write(self, record: FailedEvent, event: Any) -> None:
-        packed, no_event = self._packed(event)
-        with_event = replace(record, has_event=True)
+    def _write(self, record: FailedEvent, event: Any, state: bytes) -> None:
+        packed, no_event = self._packed(event, state)
+        with_event = replace(record, has_event=True, state_bytes=len(state))
         without = replace(record, has_event=False, no_event=no_event or "it could not be written")
         try:
             if packed is None or not self._is_put(with_event, packed):
@@ -181,19 +190,20 @@ class FailureStore:
         self._count("without_event", not record.has_event)
         return True
 
-    def _packed(self, event: Any) -> tuple[bytes | None, str]:
-        """Return the event as bytes, or None and the reason."""
+    def _packed(self, event: Any, state: bytes) -> tuple[bytes | None, str]:
+        """Return the state and the event as bytes, or None and the reason."""
         from epypes.service.packing import pack_event
 
         if event is None:
             return None, "the service had none to give"
         most = int(self._most_bytes * _EVENT_SHARE)
         try:
-            packed = pack_event(event)
+            packed = state + pack_event(event)
         except EpypesError as error:
             return None, str(error)
         if len(packed) > most:
-            return None, f"it has {len(packed) / 1e6:,.1f} MB, more than the {most / 1e6:,.1f} MB of one event"
+            size = f"{len(packed) / 1e6:,.1f} MB{' with its state' if state else ''}"
+            return None, f"it has {size}, more than the {most / 1e6:,.1f} MB of one event"
         return packed, ""
 
     def _put(self, record: FailedEvent, packed: bytes) -> None:
@@ -265,20 +275,21 @@ class FailureStore:
         """
         return self._read(failure_id, with_event=False)[0]
 
-    def _read(self, failure_id: str, *, with_event: bool) -> tuple[FailedEvent, bytes]:
-        """Return what is in a failure's file: its record, and its packed event if that is wanted."""
+    def _read(self, failure_id: str, *, with_event: bool) -> tuple[FailedEvent, bytes, bytes]:
+        """Return what is in a failure's file: its record; and its state and its packed event if they are wanted."""
         path = self._path(failure_id)
         if not ID.fullmatch(failure_id) or not path.exists():
             raise UnknownName("failure", failure_id, reversed(self._stored()), f"in {self.folder}")
         try:
             with path.open("rb") as file:
                 record = read_record(json.loads(file.readline()))
+                state = file.read(record.state_bytes) if with_event else b""
                 packed = file.read() if with_event else b""
             if record.id != failure_id:
                 raise ValueError(f"it is the record of {record.id}")
         except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
             raise _damaged(failure_id, path, error) from error
-        return record, packed
+        return record, state, packed
 
     def packed_event(self, failure_id: str) -> bytes:
         """Return the event of a failure as `pack_event` packed it.
@@ -290,7 +301,7 @@ class FailureStore:
         FailureNotKept
             Its event was not kept, or can't be read any more.
         """
-        record, packed = self._read(failure_id, with_event=True)
+        record, _, packed = self._read(failure_id, with_event=True)
         if not record.has_event:
             reason = record.no_event or "the service had none to give"
             raise FailureNotKept(failure_id, self.folder, f"The event of failure {failure_id} was not kept: {reason}.")
@@ -311,6 +322,17 @@ class FailureStore:
             return unpack_event(packed)
         except MessageError as error:
             raise _damaged(failure_id, self._path(failure_id), error) from error
+
+    def state(self, failure_id: str) -> bytes:
+        """Return the encoded state between events that a failure began with; empty for the initial one.
+
+        Raises
+        ------
+        UnknownName, FailureNotKept
+            As `packed_event`.
+        """
+        self.packed_event(failure_id)
+        return self._read(failure_id, with_event=True)[1]
 
     def _stored(self) -> dict[str, int]:
         """Return the size of each file by its failure's id, the oldest first; raise OSError if that can't be read."""

@@ -45,6 +45,7 @@ _TAGS: Final = [
 ]
 _PAGE: Final = Path(__file__).parent / "page"
 _EVENT: Final = "application/vnd.epypes.v1+event"
+_STATE: Final = "application/vnd.epypes.v1+state"
 _NON_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 
 health = APIRouter(tags=["health"])
@@ -214,6 +215,16 @@ def failed_event(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 
     return Response(service.failure_store.packed_event(id), media_type=_EVENT)
 
 
+@failures.get(
+    "/{id}/state",
+    response_class=Response,
+    responses={**_FAILURE_REFUSALS, 200: {"description": "The state, packed.", "content": {_STATE: models.BINARY}}},
+)
+def failed_state(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
+    """Return the state between events that the event began with; nothing for the initial one, and without state."""
+    return Response(service.failure_store.state(id), media_type=_STATE)
+
+
 # -- operation --------------------------------------------------------------------------------------------------------
 
 _DEPLOY_REFUSALS: Final[Responses] = CHANGE_REFUSALS | {
@@ -235,13 +246,24 @@ def deploy(service: ServiceOf, wanted: models.Deploy) -> Response:
     if not os.path.isabs(wanted.bundle) or not os.path.isdir(wanted.bundle):
         text = f"{wanted.bundle!r:.300} is no folder on the service's machine. Name a bundle's absolute path."
         raise BundleError(wanted.bundle, text)
-    return json_response(service.deploy(wanted.bundle))
+    return json_response(service.deploy(wanted.bundle, wanted.state))
 
 
 @operation.post("/rollback", response_model=models.Info, responses=_DEPLOY_REFUSALS)
-def rollback(service: ServiceOf) -> Response:
+def rollback(service: ServiceOf, wanted: Annotated[models.Rollback | None, Body()] = None) -> Response:
     """Serve the bundle again that was served before this one."""
-    return json_response(service.rollback())
+    return json_response(service.rollback((wanted or models.Rollback()).state))
+
+
+@operation.post(
+    "/reset",
+    response_model=models.Info,
+    responses={**CHANGE_REFUSALS, 404: refused("There is no state of this source."), 422: INVALID},
+)
+def reset(service: ServiceOf, wanted: Annotated[models.Reset | None, Body()] = None) -> Response:
+    """Have the next event begin with the initial state between events, as if it were the first."""
+    service.reset((wanted or models.Reset()).source)
+    return json_response(service.info())
 
 
 @operation.post("/pause", response_model=models.Info, responses=CHANGE_REFUSALS)

@@ -62,6 +62,11 @@ class ServiceCollector:
             GaugeMetricFamily("epypes_state", "1 for the state that the service is in.", labels=["state"]),
             {state: float(state == service.state) for state in _STATES},
         )
+        if states := info.get("states"):
+            yield GaugeMetricFamily("epypes_states", "States between events, of all sources.", states["count"])
+            yield GaugeMetricFamily("epypes_states_bytes", "Their size.", states["bytes"])
+            about = "States that were forgotten, since there were too many."
+            yield CounterMetricFamily("epypes_states_forgotten", about, states["forgotten"])
         yield from self._events()
         yield from self._times()
         yield from self._event_log()

@@ -8,6 +8,7 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from epypes.service import Service
+from epypes.service.event_states import StateChoice
 from epypes.service.failures.record import FailedEvent
 
 Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
@@ -18,6 +19,15 @@ Entries = Annotated[
     Field(
         description="By token: the value, and what it may be, as in pipeline.toml. Its type is int, float, bool, text, "
         "list, none or other: a float may be given as 1 and as 1.5."
+    ),
+]
+
+
+StateFate = Annotated[
+    StateChoice | None,
+    Field(
+        description="Whether the state between events is kept or reset; null to keep it if both bundles delay the same "
+        "tokens with the same initial values."
     ),
 ]
 
@@ -71,6 +81,16 @@ class Ready(BaseModel):
     reason: str
 
 
+class States(BaseModel):
+    """The state between events."""
+
+    per: str = Field(description="What has a state of its own: one for all events, or each source.", examples=["one"])
+    tokens: dict[str, str] = Field(description="By key of the state, the token that is delayed.")
+    count: int = Field(description="How many states there are.")
+    bytes: int = Field(description="Their size.")
+    forgotten: int = Field(description="How many were forgotten, since there were too many.")
+
+
 class Info(BaseModel):
     """What is served, by which processes, at which addresses."""
 
@@ -97,6 +117,7 @@ class Info(BaseModel):
     started_ns: int
     restarts: int
     counts: dict[str, int]
+    states: States | None = None
     versions: dict[str, str]
 
 
@@ -178,6 +199,21 @@ class Deploy(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"example": {"bundle": "/srv/edges-2"}})
     bundle: str = Field(min_length=1, max_length=4_096, description="An absolute path on the service's machine.")
+    state: StateFate = None
+
+
+class Rollback(BaseModel):
+    """What becomes of the state between events."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    state: StateFate = None
+
+
+class Reset(BaseModel):
+    """Which state between events begins anew."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    source: str | None = Field(default=None, max_length=4_096, description="Of one source of events; null for all.")
 
 
 class Drain(BaseModel):

@@ -22,6 +22,7 @@ from epypes.service.remote.control import Control, Event, read_parameters, split
 
 if TYPE_CHECKING:
     from epypes.display import GraphView
+    from epypes.service.event_states import StateChoice
     from epypes.service.remote.runner import RemoteRunner
     from epypes.wire import Envelope
 
@@ -197,6 +198,10 @@ class Connection:
         event = unpack_event(self._control.content(f"{path}/event")[1]) if record.has_event else None
         return record, event
 
+    def failure_state(self, failure_id: str) -> bytes:
+        """Return the packed state between events that a failure began with; empty for the initial one."""
+        return self._control.content(f"/v1/failures/{quote(failure_id, safe='')}/state")[1]
+
     def events(self) -> Iterator[Event]:
         """Yield what happens in the service as it happens: ``("run", {...})``, state, failure, parameters and counts.
 
@@ -243,19 +248,42 @@ class Connection:
         body = self._control.change("POST", "/v1/parameters/write-back", {"dry_run": dry_run}, _REPLAY_TIMEOUT_S)
         return WriteBack(str(body.get("diff", "")), str(body.get("digest", "")))
 
-    def deploy(self, path: str | Path) -> dict[str, Any]:
+    def deploy(self, path: str | Path, state: StateChoice | None = None) -> dict[str, Any]:
         """Serve another bundle on the service's machine from the next event on.
+
+        Parameters
+        ----------
+        path
+            The bundle.
+        state
+            Whether to ``"keep"`` or ``"reset"`` the state between events. Without, it is kept if both bundles delay the
+            same tokens with the same initial values; ``changed`` says what was done.
 
         Raises
         ------
         DeployRefused
             It does not compute what was recorded, or does not fit; the bundle before goes on.
         """
-        return self._post("deploy", {"bundle": str(Path(path).resolve())})
+        return self._post("deploy", {"bundle": str(Path(path).resolve()), **_chosen(state)})
 
-    def rollback(self) -> dict[str, Any]:
-        """Serve the bundle again that was served before."""
-        return self._post("rollback")
+    def rollback(self, state: StateChoice | None = None) -> dict[str, Any]:
+        """Serve the bundle again that was served before; ``state`` as for `deploy`."""
+        return self._post("rollback", _chosen(state))
+
+    def reset(self, source: str | None = None) -> dict[str, Any]:
+        """Have the next event begin with the initial state between events, as if it were the first.
+
+        Parameters
+        ----------
+        source
+            Of events, whose state alone is reset; every state without.
+
+        Raises
+        ------
+        ServiceError
+            The bundle has no state, or there is none of this source.
+        """
+        return self._post("reset", {} if source is None else {"source": source})
 
     def pause(self) -> dict[str, Any]:
         """Let events wait."""
@@ -343,3 +371,7 @@ class Connection:
             return read_record(entries)
         except ValueError as error:
             raise ServiceError(self.url, f"A failure at {self.url} can't be read: {error}.") from error
+
+
+def _chosen(state: StateChoice | None) -> dict[str, str]:
+    return {} if state is None else {"state": state}

@@ -61,7 +61,8 @@ class RemoteRunner:
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         info, parameters = connection.info(), connection.parameters()
-        self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _orders(connection, info))
+        states = (info.get("states") or {}).get("tokens", {})
+        self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _orders(connection, info), states)
         self._runs = RemoteRuns(connection, self.cg, parameters, info["outputs"])
         self._shown = ShownRuns()
         # Set to end the thread that follows the events; None without a thread.
@@ -102,7 +103,8 @@ class RemoteRunner:
     @property
     def free_source_tokens(self) -> tuple[str, ...]:
         """The source tokens that an event brings."""
-        return tuple(token for token in self.cg.source_tokens if token not in self._taken)
+        known = {**self._taken, **self.cg.delays}
+        return tuple(token for token in self.cg.source_tokens if token not in known)
 
     @property
     def stale(self) -> tuple[str, ...]:
@@ -145,7 +147,8 @@ class RemoteRunner:
         Returns
         -------
         Run
-            If the last event failed, its ``failure`` says so.
+            If the last event failed, its ``failure`` says so. If no event has come since the values were set, the last
+            one is run again, on the state between events that it began with; the service's state stays as it is.
 
         Raises
         ------

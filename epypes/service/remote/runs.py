@@ -14,7 +14,7 @@ from epypes.bundle.adapters import in_order
 from epypes.bundle.settings import decode_value
 from epypes.catalog import plain
 from epypes.errors import EpypesError, RemoteFailure, ServiceError
-from epypes.graph import CompGraph, colour_order, subgraph
+from epypes.graph import CompGraph, colour_order, delay, subgraph
 from epypes.hints import Param
 from epypes.images import Image, Order
 from epypes.run import Failure, Run
@@ -44,6 +44,7 @@ def remote_graph(
     func_io: Mapping[str, Sequence[Any]],
     entries: Mapping[str, Mapping[str, Any]],
     orders: Mapping[str, Order],
+    states: Mapping[str, str],
 ) -> CompGraph:
     """Return the graph of a service, whose functions say where they run when they are called here.
 
@@ -57,6 +58,8 @@ def remote_graph(
         Of the hyperparameters, by token: their ranges become annotations.
     orders
         The orders of colours by token, where a function of the service says them.
+    states
+        By key of the state between events, the token that is delayed.
 
     Raises
     ------
@@ -75,7 +78,12 @@ def remote_graph(
                 hints[token] = Annotated[Any, Param(**known)]
     io: dict[str, Any] = {name: (_as_tuple(taken), _as_tuple(made)) for name, (taken, made) in func_io.items()}
     functions = {name: RemoteFunction(url, name, taken, made, hints) for name, (taken, made) in io.items()}
-    return CompGraph(functions, io, types=False)
+    cg = CompGraph(functions, io, types=False)
+    for previous, token in states.items():
+        # Those of nested pipelines are no tokens of this graph.
+        if cg.has_token(previous) and cg.has_token(token):
+            cg = delay(cg, token, previous)
+    return cg
 
 
 def _as_tuple(side: Any) -> Any:

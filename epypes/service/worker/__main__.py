@@ -32,6 +32,7 @@ from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessag
 from epypes.service.worker.inputs import FRONT_GONE, Inputs, not_understood
 from epypes.service.worker.run_queries import QueryAnswerer
 from epypes.service.worker.slots import Slot, SlotParameters
+from epypes.service.worker.states import WorkerStates, describe_delays
 
 _ENDED: Final = 0
 _REFUSED: Final = 1
@@ -57,6 +58,11 @@ class Worker:
     threads
         How many events it works on at once. OpenCV's own threads are left as they were during the replay: with
         several slots they compete for the same cores.
+
+    Attributes
+    ----------
+    delays
+        What the bundle keeps between events; see `describe_delays`.
     """
 
     def __init__(self, front: FrameSocket, control: ControlSocket, bundle: Bundle, threads: int) -> None:
@@ -65,8 +71,10 @@ class Worker:
         parameters = SlotParameters(trial, bundle.enums)
         self._answers = answers = QueryAnswerer(front, parameters)
         self._inputs = inputs = Inputs(front, parameters.apply)
-        self._slots = [Slot(bundle, inputs, front, parameters, answers) for _ in range(threads)]
+        states = WorkerStates()
+        self._slots = [Slot(bundle, inputs, front, parameters, answers, states) for _ in range(threads)]
         parameters.pipelines = [slot.pipeline for slot in self._slots]
+        self.delays = describe_delays(self._slots[0].pipeline, bundle.settings.states)
 
     def work(self) -> None:
         """Work until the front sends that nothing more comes; the process ends if the front is gone."""
@@ -168,6 +176,7 @@ def _loaded(front: FrameSocket, control: ControlSocket, path: Path, threads: int
         "report": str(report),
         "pid": os.getpid(),
         "functions": functions,
+        "delays": worker.delays,
         "func_io": {name: [bundle.cg.func_inputs(name), bundle.cg.func_outputs(name)] for name in functions},
     }
     front.send(WorkerMessage("ready", content=ready))

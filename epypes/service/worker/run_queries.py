@@ -47,11 +47,12 @@ class QueryRefused(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompletedRun:
-    """A completed run, the id of its event, and the revision of its parameters."""
+    """A completed run, the id of its event, the revision of its parameters, and the state that it began with."""
 
     run: Run
     event_id: str
     revision: int
+    state: Mapping[str, Any] | None = None
 
 
 class QueryAnswerer:
@@ -161,10 +162,11 @@ class QueryAnswerer:
         if again is None or of is not completed or again.revision != revision:
             runner = self._parameters.trial.runner
             payload = {token: completed.run[token] for token in runner.free_source_tokens}
-            run = runner.trial({}, payload=payload)
+            # It begins with the state that the event began with: only the parameters differ.
+            run = runner.trial({}, payload=payload, state=completed.state)
             if run.failure is not None:
                 raise QueryRefused("failed", str(run.failure))
-            again = CompletedRun(run, completed.event_id, revision)
+            again = CompletedRun(run, completed.event_id, revision, completed.state)
             self._again = completed, again
         return _values(again, query)
 

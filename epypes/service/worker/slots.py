@@ -25,15 +25,17 @@ from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline
 from epypes.run import Failure, Run
 from epypes.service.frame_socket import FrameSocket, WorkerMessage
-from epypes.service.packing import BytesLike
+from epypes.service.packing import BytesLike, pack_state
 from epypes.service.worker.inputs import Inputs
 from epypes.service.worker.run_queries import CompletedRun, QueryAnswerer
+from epypes.service.worker.states import State, WorkerStates
 from epypes.wire import Envelope, decode, encode, failure_event, serialized
 from epypes.wire.envelope import request_fields
 
 _MAX_TRACE_FRAMES: Final = 20
 _MAX_LINE: Final = 500
 _MAX_MESSAGE: Final = 2_000
+_UNKNOWN: Final = object()
 _EPYPES_FOLDER: Final = str(Path(epypes.__file__).parent)
 
 _log: Final = logging.getLogger("epypes.service")
@@ -54,10 +56,18 @@ class Slot:
         Whose revision a run begins with.
     answers
         Gets each run that has completed.
+    states
+        What the events before have left, if the bundle has state between events.
     """
 
     def __init__(
-        self, bundle: Bundle, inputs: Inputs, front: FrameSocket, parameters: SlotParameters, answers: QueryAnswerer
+        self,
+        bundle: Bundle,
+        inputs: Inputs,
+        front: FrameSocket,
+        parameters: SlotParameters,
+        answers: QueryAnswerer,
+        states: WorkerStates,
     ) -> None:
         self._inputs, self._front, self._parameters, self._answers = inputs, front, parameters, answers
         self._digest = bundle.digest
@@ -70,6 +80,9 @@ class Slot:
             Failure("handle", (), {}, error, getattr(event, "id", ""))
         )
         self._is_last_put = _puts_last(self.pipeline)
+        self._states = states if bundle.settings.states else None
+        # What the pipeline has taken over from `_states` last; None for the initial state.
+        self._state: object = None
 
     @property
     def running(self) -> dict[str, Any] | None:
@@ -108,6 +121,8 @@ class Slot:
             self._work = work = _Work(message.number, revision, before, stamp={"revision": revision})
             try:
                 frames = message.frames
+                if self._states is not None:
+                    frames = self._take_state(self._states, message, work)
                 event = bytes(frames[0]) if len(frames) == 1 else decode(frames)
             except Exception as error:
                 self._failed(Failure("f_in", self.pipeline.runner.free_source_tokens, {}, error))
@@ -117,6 +132,19 @@ class Slot:
                 work.event_id = event.id
                 work.stamp |= request_fields(event)
             return event
+
+    def _take_state(self, states: WorkerStates, message: WorkerMessage, work: _Work) -> Sequence[BytesLike]:
+        """Have the pipeline go on with the state that an event begins with; return the frames of the event."""
+        state, frames = states.begin(message)
+        if state is not self._state:
+            # It has worked on another series, or the event before has failed.
+            if state is None:
+                self.pipeline.reset()
+            else:
+                self.pipeline.state = state
+            self._state = state
+        work.message, work.state = message, state
+        return frames
 
     # -- as q_out -----------------------------------------------------------------------------------------------
 
@@ -155,7 +183,7 @@ class Slot:
         if run is work.before:
             run = None
         if run is not None and run.failure is None:
-            self._answers.note(CompletedRun(run, work.event_id, work.revision))
+            self._answers.note(CompletedRun(run, work.event_id, work.revision, work.state))
         try:
             try:
                 self._send(work, run)
@@ -170,6 +198,7 @@ class Slot:
 
     def _send(self, work: _Work, run: Run | None) -> None:
         answers = work.answers
+        state = [] if self._states is None else self._leave_state(self._states, work)
         if work.failure is not None:
             event = failure_event(work.failure, self.pipeline.name, self._digest)
             answers = [*answers, _answer(event, work.stamp)]
@@ -181,7 +210,26 @@ class Slot:
             # How many frames belong to each: one of 2019, or those of an envelope.
             "answers": [*map(len, answers)],
         }
-        self._front.send(WorkerMessage("done", work.seq, content, [*chain.from_iterable(answers)]))
+        if state:
+            content["has_state"] = True
+        self._front.send(WorkerMessage("done", work.seq, content, [*chain.from_iterable(answers), *state]))
+
+    def _leave_state(self, states: WorkerStates, work: _Work) -> list[bytes]:
+        """Keep what an event has left for the next one, and return it encoded; nothing if the event failed."""
+        # The graph may have gone on before f_out failed: the pipeline takes the state over anew then.
+        self._state = _UNKNOWN
+        if work.failure is not None or work.message is None:
+            return []
+        state = self.pipeline.state
+        try:
+            block = pack_state(state)
+        except MessageError as error:
+            work.answers.clear()
+            work.failure = Failure("state", tuple(state), {}, error, work.event_id)
+            return []
+        states.keep(work.message, state)
+        self._state = state
+        return [block]
 
 
 @dataclass(slots=True, eq=False)
@@ -196,6 +244,8 @@ class _Work:
         The last run before it.
     stamp
         Fields of every envelope that answers it.
+    message, state
+        Where the graph has state between events: the message that it came in, and what it begins with.
     """
 
     seq: int
@@ -206,6 +256,8 @@ class _Work:
     answers: list[list[BytesLike]] = field(default_factory=list)
     failure: Failure | None = None
     start_ns: int = field(default_factory=perf_counter_ns)
+    message: WorkerMessage | None = None
+    state: State = None
 
 
 def _answer(item: Any, stamp: Mapping[str, Any]) -> list[BytesLike]:

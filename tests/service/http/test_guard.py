@@ -17,6 +17,7 @@ CHANGES = [
     ("POST", "/v1/access"),
     ("POST", "/v1/deploy"),
     ("POST", "/v1/rollback"),
+    ("POST", "/v1/reset"),
     ("POST", "/v1/pause"),
     ("POST", "/v1/resume"),
     ("POST", "/v1/drain"),
