@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
+import pytest
+
 import epypes as ep
 from epypes.bundle.clone import clone_graph
 
@@ -37,3 +41,32 @@ def test_a_node_that_does_something_of_its_own_is_kept():
     louder = Louder("times", times)
     cg = ep.CompGraph({"times": louder}, {"times": (("x", "gain"), "y")})
     assert clone_graph(cg).functions["times"] is louder
+
+
+def lightened(image):
+    return image + 1
+
+
+@pytest.mark.slow
+def test_a_nested_pipeline_without_guard_and_functions_that_write_into_their_inputs_are_promoted(tmp_path):
+    inner = ep.Pipeline(
+        "inner",
+        ep.CompGraph(
+            {"lightened": lightened, "draw": cv2.circle},
+            {"lightened": ("image", "light"), "draw": (("light", "centre", "radius", "colour"), "drawn")},
+        ),
+        settings := {"centre": (4, 4), "radius": 2, "colour": 200},
+        guard=False,
+    )
+    cg = ep.CompGraph(
+        {"inner": inner, "again": cv2.circle},
+        {"inner": ("image", "once"), "again": (("once", "centre", "radius", "colour"), "twice")},
+    )
+    runner = ep.CompGraphRunner(cg, {**settings, "centre": (8, 8)})
+    image = np.zeros((12, 12), np.uint8)
+    run = runner.run(image=image)
+    ep.promote(runner, tmp_path / "drawing")
+    loaded = ep.load(tmp_path / "drawing")
+    assert np.array_equal(loaded.run(image=image)["twice"], run["twice"])
+    assert not image.any()
+    assert loaded.cg.functions["inner"].runner.guard is False
