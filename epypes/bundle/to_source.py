@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain, takewhile
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any, Final
 
 from epypes.bundle.clone import is_plain_pipeline
@@ -29,6 +29,7 @@ from epypes.bundle.references import global_names, meanings_of, nested_codes
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, Switch, as_switch
+from epypes.graph.signature import distinct
 from epypes.nothing import Nothing
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
@@ -202,8 +203,9 @@ def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dic
 
 def _may_find_nothing(function: Any) -> bool:
     """Whether a function, or one of the user's that it calls by name, refers to Nothing, also as ``ep.Nothing``."""
+    function = without_nodes(function)
     if is_plain_pipeline(function):
-        return any(_may_find_nothing(without_nodes(inner)) for inner in function.cg.functions.values())
+        return any(map(_may_find_nothing, distinct(function.cg.functions).values()))
     pending, seen = [function], set[int]()
     while pending:
         reached = without_nodes(pending.pop())
@@ -215,7 +217,8 @@ def _may_find_nothing(function: Any) -> bool:
         codes = [*nested_codes(reached.__code__)]
         meant = meanings_of(reached, {*global_names(reached.__code__), *reached.__code__.co_freevars}).values()
         is_named = any("Nothing" in code.co_names for code in codes)
-        if any(value is Nothing or (is_named and getattr(value, "Nothing", None) is Nothing) for value in meant):
+        modules = [value for value in meant if is_named and isinstance(value, ModuleType)]
+        if any(value is Nothing for value in (*meant, *(getattr(module, "Nothing", None) for module in modules))):
             return True
         pending += meant
     return False
@@ -256,8 +259,8 @@ class _Function:
         By function, the expression that refers to it.
     defaults
         By hyperparameter, the expression of its value.
-    may_be_nothing
-        The tokens that may be Nothing.
+    finders, may_be_nothing
+        The functions that may return Nothing, and the tokens that may be Nothing.
     nothing
         The expression of Nothing; "" if it is not needed.
     variables
@@ -278,7 +281,7 @@ class _Function:
         self.switches = {each: self._keys(each, switch) for each, switch in switches.items() if switch is not None}
         self.calls = {each: self._call(each) for each in self.regions if each not in self.switches}
         self.defaults = {token: self._default(token, value) for token, value in values.items() if token in tokens}
-        self.may_be_nothing = self._found_nothing()
+        self.finders, self.may_be_nothing = self._found_nothing()
         self.nothing = self._nothing() if self.may_be_nothing else ""
         self.variables = self._named(tokens)
         module.texts.append(self._text())
@@ -297,14 +300,16 @@ class _Function:
     def _nothing(self) -> str:
         return self.module.expression("Nothing", Nothing, _NO_EXPRESSION)
 
-    def _found_nothing(self) -> set[str]:
-        """Return the tokens that may be Nothing."""
-        found: set[str] = {token for token, value in self.values.items() if value is Nothing}
+    def _found_nothing(self) -> tuple[set[str], set[str]]:
+        """Return the functions that may return Nothing, and the tokens that may be Nothing."""
+        # A large graph has few functions under many names.
+        finds = {key: _may_find_nothing(function) for key, function in distinct(self.cg.functions).items()}
+        finders = {name for name in self.regions if finds[id(self.cg.functions[name])]}
+        found = {token for token, value in self.values.items() if value is Nothing}
         for name in self.regions:
-            inputs, function = self.cg.func_inputs(name), without_nodes(self.cg.functions[name])
-            if not found.isdisjoint(inputs) or _may_find_nothing(function):
+            if name in finders or not found.isdisjoint(self.cg.func_inputs(name)):
                 found.update(self.cg.func_outputs(name))
-        return found
+        return finders, found
 
     def _keys(self, name: str, switch: Switch) -> dict[str, list[str]]:
         """Return the expressions of the values by which a switch chooses each token."""
@@ -375,7 +380,7 @@ class _Function:
     def _call_lines(self, name: str, depth: int) -> Iterator[str]:
         arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
         call, outputs = f"{self.calls[name]}({arguments})", self.cg.func_outputs(name)
-        if self.cg.has_single_output(name) or not outputs or outputs[0] not in self.may_be_nothing:
+        if self.cg.has_single_output(name) or not outputs or name not in self.finders:
             yield from laid_out(call, depth, self._targets(name))
             return
         # Nothing alone stands for all of them.
