@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain, takewhile
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any, Final, NamedTuple
 
 from epypes.bundle.clone import is_plain_pipeline
@@ -33,6 +33,7 @@ from epypes.bundle.settings import states_of
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, Switch, as_switch, subgraph
+from epypes.graph.signature import distinct
 from epypes.nothing import Nothing
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
@@ -50,7 +51,7 @@ _NO_INITIAL: Final = (
     "None."
 )
 _STATE_OF_NOTHING: Final = (
-    "keeps state, and takes what may be Nothing. Make what it keeps a delay of this graph (ep.delay)."
+    "keeps state, and takes or makes what may be Nothing. Make what it keeps a delay of this graph (ep.delay)."
 )
 _SOME_BRANCHES: Final = (
     "makes what the next run begins with, and only some branches of switches need it, so that no line of a function "
@@ -257,8 +258,9 @@ def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dic
 
 def _may_find_nothing(function: Any) -> bool:
     """Whether a function, or one of the user's that it calls by name, refers to Nothing, also as ``ep.Nothing``."""
+    function = without_nodes(function)
     if is_plain_pipeline(function):
-        return any(_may_find_nothing(without_nodes(inner)) for inner in function.cg.functions.values())
+        return any(map(_may_find_nothing, distinct(function.cg.functions).values()))
     pending, seen = [function], set[int]()
     while pending:
         reached = without_nodes(pending.pop())
@@ -270,7 +272,8 @@ def _may_find_nothing(function: Any) -> bool:
         codes = [*nested_codes(reached.__code__)]
         meant = meanings_of(reached, {*global_names(reached.__code__), *reached.__code__.co_freevars}).values()
         is_named = any("Nothing" in code.co_names for code in codes)
-        if any(value is Nothing or (is_named and getattr(value, "Nothing", None) is Nothing) for value in meant):
+        modules = [value for value in meant if is_named and isinstance(value, ModuleType)]
+        if any(value is Nothing for value in (*meant, *(getattr(module, "Nothing", None) for module in modules))):
             return True
         pending += meant
     return False
@@ -350,8 +353,8 @@ class _Function:
         The expression that refers to what copies them; empty if there are none.
     defaults
         By hyperparameter, the expression of its value.
-    may_be_nothing
-        The tokens that may be Nothing.
+    finders, may_be_nothing
+        The functions that may return Nothing, and the tokens that may be Nothing.
     nothing
         The expression of Nothing; "" if it is not needed.
     variables
@@ -394,7 +397,7 @@ class _Function:
             previous: self._default(previous, cg.delays[previous].initial, "The initial value of", _NO_INITIAL)
             for previous in delays
         }
-        self.may_be_nothing = self._found_nothing(delays)
+        self.finders, self.may_be_nothing = self._found_nothing(delays)
         self.nothing = self._nothing() if self.may_be_nothing else ""
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
         sources = {*self.calls.values(), *keys, *filter(None, [self.copy, self.nothing])}
@@ -403,7 +406,7 @@ class _Function:
         self.left: dict[str, str] = {}
         self.states = [*self._states(delays, keepers)]
         for name in keepers:
-            if not self.may_be_nothing.isdisjoint(cg.func_inputs(name)):
+            if name in self.finders or not self.may_be_nothing.isdisjoint(cg.func_inputs(name)):
                 module.gathered.refusals.append(f"Function {name!r}{where} {_STATE_OF_NOTHING}")
         module.texts.append(self._text())
 
@@ -450,15 +453,17 @@ class _Function:
     def _nothing(self) -> str:
         return self.module.expression("Nothing", Nothing, _NO_EXPRESSION)
 
-    def _found_nothing(self, delays: Iterable[str]) -> set[str]:
-        """Return the tokens that may be Nothing."""
-        found: set[str] = {token for token, value in self.values.items() if value is Nothing}
+    def _found_nothing(self, delays: Iterable[str]) -> tuple[set[str], set[str]]:
+        """Return the functions that may return Nothing, and the tokens that may be Nothing."""
+        # A large graph has few functions under many names.
+        finds = {key: _may_find_nothing(function) for key, function in distinct(self.cg.functions).items()}
+        finders = {name for name in self.regions if finds[id(self.cg.functions[name])]}
+        found = {token for token, value in self.values.items() if value is Nothing}
         found.update(previous for previous in delays if self.cg.delays[previous].initial is Nothing)
         for name in self.regions:
-            inputs, function = self.cg.func_inputs(name), without_nodes(self.cg.functions[name])
-            if not found.isdisjoint(inputs) or _may_find_nothing(function):
+            if name in finders or not found.isdisjoint(self.cg.func_inputs(name)):
                 found.update(self.cg.func_outputs(name))
-        return found
+        return finders, found
 
     def _keys(self, name: str, switch: Switch) -> dict[str, list[str]]:
         """Return the expressions of the values by which a switch chooses each token."""
@@ -551,7 +556,7 @@ class _Function:
             f"{state.inner}={state.parameter}" for state in self.states if state.maker == name and state.inner
         ]
         call, outputs = f"{self.calls[name]}({', '.join(arguments)})", self.cg.func_outputs(name)
-        if self.cg.has_single_output(name) or not outputs or outputs[0] not in self.may_be_nothing:
+        if self.cg.has_single_output(name) or not outputs or name not in self.finders:
             yield from laid_out(call, depth, self._targets(name))
             return
         # Nothing alone stands for all of them.
