@@ -413,7 +413,8 @@ def module_reads(function: types.FunctionType) -> list[tuple[str, Any]]:
         with suppress(Exception):  # the function raises the same when it is called
             if not will_be_installed(name):
                 found.append((plain_name(name), import_module(name)))
-    meanings = meanings_of(function, {*function.__code__.co_freevars, *global_names(function.__code__)})
+    # In an order that is the same in each process.
+    meanings = meanings_of(function, sorted({*function.__code__.co_freevars, *global_names(function.__code__)}))
     waiting, seen = [*meanings.items(), *found], set[str]()
     while waiting:
         name, value = waiting.pop()

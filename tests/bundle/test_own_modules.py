@@ -128,6 +128,7 @@ def test_modules_beside_the_notebook_come_along_with_what_they_import(project):
 
 
 @SLOW
+@pytest.mark.usefixtures("fresh_interpreter")  # with another hash seed
 def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_and_decorator(project):
     project.write(
         lib__init="from lib.tools import *\n",
@@ -157,6 +158,7 @@ def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_a
                 return add
             """,
         namespace__inner__deep="def half(x):\n    return x / 2\n",
+        acme__mine="def f(x):\n    return 2 - x\n",
         flat="def third(x):\n    return x / 3\n",
         pipeline="def tenth(x):\n    return x / 10\n",
     )
@@ -166,6 +168,8 @@ def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_a
         import namespace.inner.deep
         from namespace.inner import deep as d
         from lib import scaled, WEIGHTS
+        import acme.mine
+        import acme.mine as m
         import flat
         import pipeline
 
@@ -176,6 +180,9 @@ def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_a
         def attributes(x):
             return l.tools.doubled(x) + namespace.inner.deep.half(x) + d.half(x) + l.Mode.FAST
 
+        def by_two_names(x):
+            return acme.mine.f(x) + m.f(x)
+
         def late(x):
             from flat import third
             return third(x) + pipeline.tenth(x)
@@ -183,9 +190,15 @@ def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_a
         adder = l.tools.make(4)
         """
     path = project.promote(
-        cell, mine="mine", attributes="attributes", late="late", doubled="lib.tools.doubled", adder="adder"
+        cell,
+        mine="mine",
+        attributes="attributes",
+        late="late",
+        both="by_two_names",
+        doubled="lib.tools.doubled",
+        adder="adder",
     )
-    expected = {"lib/__init__.py", "lib/tools.py", "namespace/inner/deep.py", "flat.py", "pipeline.py"}
+    expected = {"lib/__init__.py", "lib/tools.py", "namespace/inner/deep.py", "acme/mine.py", "flat.py", "pipeline.py"}
     assert own_files(path) == expected
 
 
