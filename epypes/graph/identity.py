@@ -41,7 +41,7 @@ def inner_graph(function: Any) -> CompGraph | None:
     from epypes.graph.compgraph import CompGraph
 
     try:
-        inner = getattr(function, "cg", None)
+        inner = getattr(function, "cg", None) if hasattr(type(function), "cg") else None
         return inner if isinstance(inner, CompGraph) else None
     except Exception:  # whatever an object's __getattr__ raises
         return None
