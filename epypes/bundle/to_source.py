@@ -344,7 +344,8 @@ class _Function:
         }
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
         self.taken = {name for source in {*self.calls.values(), *keys} for name in names_in(source)} | {"ValueError"}
-        self.variables = self._named([token for token in cg.tokens if token in {*tokens, *delays}])
+        written = {*tokens, *delays}
+        self.variables = self._named(filter(written.__contains__, cg.tokens))
         self.left: dict[str, str] = {}
         self.states = [*self._states(delays, keepers)]
         module.texts.append(self._text())
