@@ -32,7 +32,7 @@ from epypes.bundle.references import global_names, meanings_of, nested_codes
 from epypes.bundle.settings import states_of
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
-from epypes.graph import CompGraph, Switch, as_switch, subgraph
+from epypes.graph import CompGraph, Switch, as_switch, needed_for
 from epypes.graph.signature import distinct
 from epypes.nothing import Nothing
 from epypes.pipeline import Pipeline
@@ -373,9 +373,9 @@ class _Function:
         self.module, self.name, self.cg, self.where = module, name, cg, where
         self.values = values
         self.returns = cg.sink_tokens if wanted is None else wanted
-        part = cg if wanted is None or not states_of(cg) else subgraph(cg, wanted)
-        delays = [*part.delays]
-        keepers = [name for name, function in part.functions.items() if _has_state(function)]
+        found, needed = (set(cg.tokens), set(cg.functions)) if wanted is None else needed_for(cg, wanted)
+        delays = [previous for previous in cg.delays if previous in found]
+        keepers = [name for name, function in cg.functions.items() if name in needed and _has_state(function)]
         made = self._made_for_states(delays, keepers)
         exact = _runs_exactly(cg) if made else {}
         roots = [token for token, maker in made.items() if not exact.get(maker)]
@@ -402,7 +402,8 @@ class _Function:
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
         sources = {*self.calls.values(), *keys, *filter(None, [self.copy, self.nothing])}
         self.taken = {name for source in sources for name in names_in(source)} | {"ValueError"}
-        self.variables = self._named([token for token in cg.tokens if token in {*tokens, *delays}])
+        written = {*tokens, *delays}
+        self.variables = self._named(filter(written.__contains__, cg.tokens))
         self.left: dict[str, str] = {}
         self.states = [*self._states(delays, keepers)]
         for name in keepers:
@@ -498,7 +499,7 @@ class _Function:
         is_several = len(self.returns) != 1
         if states:
             after = ", ".join(f'"{each.parameter}": {each.following or each.after}' for each in states)
-            returned = f"{f'({returned})' if is_several else returned}, {{{after}}}"
+            returned = f"{f'({returned})' if len(self.returns) > 1 else returned or None}, {{{after}}}"
         if returned:
             is_line = not (is_several or states) or len(returned) + len("    return ") <= LINE
             lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")
