@@ -82,7 +82,7 @@ def undisturbed(bundle, numbers):
     return found
 
 
-@pytest.mark.parametrize("kills", [12, pytest.param(150, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("kills", [12, pytest.param(60, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("options", [{}, {"state_per": "source", "threads": 3}], ids=["one", "source"])
 def test_the_answers_are_those_of_a_service_whose_worker_is_not_killed(smoothing, quick, kills, options):
     count, chance = (kills + 1) * BETWEEN_KILLS, random.Random(kills)
