@@ -13,6 +13,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, overload
 from warnings import warn
@@ -234,14 +235,14 @@ class _Index:
     keys
         The time stamps of the key frames, rising; the first ones may not be shown.
     unit_s
-        Seconds per time stamp.
+        Seconds per time stamp, exact.
     missing
         What the file announces and does not have, as text; "" if it is whole.
     """
 
     pts: tuple[int, ...]
     keys: tuple[int, ...]
-    unit_s: float
+    unit_s: Fraction
     missing: str
 
 
@@ -283,7 +284,7 @@ def _index_of(path: Path) -> _Index:
         lasts_s = end_s - (container.start_time or 0) / av.time_base
         is_cut = is_cut or stream.frames > packets or announced_s > lasts_s + max(_MISSING_S, announced_s / 100)
         has = f"{len(pts):,} of {stream.frames:,} frames" if stream.frames > len(pts) else f"{lasts_s:.1f} s of video"
-        return _Index(tuple(sorted(pts)), tuple(sorted(keys)), float(stream.time_base or 0), has if is_cut else "")
+        return _Index(tuple(sorted(pts)), tuple(sorted(keys)), Fraction(stream.time_base or 0), has if is_cut else "")
 
 
 @contextmanager
@@ -402,7 +403,7 @@ class _VideoFile:
 
     def time_s(self, number: int) -> float:
         """Return the time of a frame since the first one."""
-        return (self.pts[number] - self.pts[0]) * self._unit_s
+        return float((self.pts[number] - self.pts[0]) * self._unit_s)
 
     def require_unchanged(self) -> None:
         """Raise ImageFileError if the file is another one than that of the index."""

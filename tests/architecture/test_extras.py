@@ -61,6 +61,10 @@ write_image("edges.png", run["edges"])
 assert np.array_equal(read_image("edges.png"), run["edges"])
 with ep.ImageAcquisition([ep.camera("edges.png")]) as acquisition:
     pass
+writer = cv2.VideoWriter("belt.avi", cv2.VideoWriter_fourcc(*"MJPG"), 25, (64, 48))
+writer.write(np.full((48, 64, 3), 90, np.uint8))
+writer.release()
+assert [frame.image.shape for frame in ep.camera("belt.avi")] == [ep.video("belt.avi")[0].shape]
 """
 
 SCALE = """
@@ -212,6 +216,7 @@ def test_without_an_extra_each_thing_names_the_one_that_it_needs(environment):
         "from epypes.transport import recording_info; recording_info('x.mcap')": "record",
         "from epypes_widgets import tune": "widgets",
         "ep.camera(0)": "vision",
+        "ep.video('x.mp4')": "vision",
         "ep.Store('results.sqlite')": "store",
         "runner.cg.to_networkx()": "widgets",
         "run.report.to_frame()": "scale",
