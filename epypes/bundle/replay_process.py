@@ -26,7 +26,7 @@ from epypes.bundle.compare import Difference, differences
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.fingerprint import Digester
 from epypes.bundle.libraries import changed_attributes, library_attributes, library_settings, load_named
-from epypes.bundle.load import Bundle, read_bundle
+from epypes.bundle.load import WITH_DELAYS, Bundle, read_bundle
 from epypes.bundle.manifest import (
     MODULE,
     REQUIREMENTS,
@@ -187,9 +187,10 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
 
 def _fingerprints(bundle: Bundle) -> dict[str, str]:
     found: dict[str, str] = {}
-    for name, function in {**bundle.cg.functions, **bundle.own}.items():
+    initial = {WITH_DELAYS: [delay.initial for delay in bundle.cg.delays.values()]}
+    for name, value in {**bundle.cg.functions, **bundle.own, **initial}.items():
         digester = Digester()
-        digester.add(as_written(function))
+        digester.add(as_written(value))
         found[name] = digester.digest().hex()
     return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import builtins
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, takewhile
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from epypes.bundle.clone import is_plain_pipeline
 from epypes.bundle.equivalence import Pair, refusal
@@ -22,9 +22,10 @@ from epypes.bundle.expressions import (
 )
 from epypes.bundle.module import module_text
 from epypes.bundle.objects import without_nodes
+from epypes.bundle.settings import states_of
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
-from epypes.graph import CompGraph, Switch, as_switch
+from epypes.graph import CompGraph, Switch, as_switch, subgraph
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
@@ -34,6 +35,14 @@ _NO_EXPRESSION: Final = "is of type {kind}, and no expression makes it again. Wr
 _NO_VALUE: Final = (
     "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
     "numbers, strings, a small array or tuples of them."
+)
+_NO_INITIAL: Final = (
+    "is of type {kind}, and no expression makes it again. Begin with None, and make it in the function when it gets "
+    "None."
+)
+_SOME_BRANCHES: Final = (
+    "makes what the next run begins with, and only some branches of switches need it, so that no line of a function "
+    "says when it runs. Give each of these branches a function of its own."
 )
 _NO_KEY: Final = "by a key of type {kind}, which no expression makes again. Choose by strings or numbers."
 # The branches of switches in which a function stands, from outside in: each a switch and the token that is passed on.
@@ -52,6 +61,9 @@ def to_source(
     The function takes the free source tokens by position, in graph order, and the hyperparameters by keyword, with
     their values as defaults. Functions that can be imported are imported; those of the notebook are written above it,
     and so is a function for every Pipeline in the graph. A switch becomes an ``if``.
+
+    The function of a graph with delays takes the state by keyword too, with the initial values as defaults. It returns
+    a pair: what it returns otherwise, and the state for the next call: ``y, state = run_graph(x, **state)``.
 
     Parameters
     ----------
@@ -135,6 +147,33 @@ def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, 
     return cg, values
 
 
+class _State(NamedTuple):
+    """What is kept from one call of a function to the next.
+
+    Attributes
+    ----------
+    parameter
+        The variable that it comes in, also its key in the state that the function returns.
+    default
+        The expression of its initial value.
+    maker
+        The function of the graph that makes it; "" if the caller does.
+    after
+        The expression of what the call leaves, where the maker is called.
+    following
+        The variable that has it in the end where only a branch of a switch calls the maker; else "".
+    inner
+        Of what a pipeline keeps, the parameter of its function; else "".
+    """
+
+    parameter: str
+    default: str
+    maker: str
+    after: str
+    following: str
+    inner: str
+
+
 class _Module:
     """The module that a graph becomes.
 
@@ -145,7 +184,7 @@ class _Module:
     texts
         The functions: one for each pipeline in the graph, then its own.
     pipelines
-        The names of the functions of pipelines, by id.
+        The functions of pipelines, by the id of the pipeline.
     compared
         What is compared with the notebook: how reasons call it, the value, its expression.
     """
@@ -153,7 +192,7 @@ class _Module:
     def __init__(self, gathered: Slice) -> None:
         self.gathered = gathered
         self.texts: list[str] = []
-        self.pipelines: dict[int, str] = {}
+        self.pipelines: dict[int, _Function] = {}
         self.compared: list[tuple[str, Any, str]] = []
 
     def expression(self, what: str, value: Any, reason: str, wanted: str = "") -> str:
@@ -170,6 +209,11 @@ class _Module:
             return [(what, ours, made) for (what, ours, _), made in zip(self.compared, module.references, strict=True)]
 
         return refusal(f"{text}references = [{sources}]\n", pairs)
+
+
+def _has_state(function: Any) -> bool:
+    inner = without_nodes(function)
+    return is_plain_pipeline(inner) and bool(states_of(inner.cg))
 
 
 def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dict[str, Region], list[str]]:
@@ -192,6 +236,41 @@ def _regions(cg: CompGraph, returns: Iterable[str], is_whole: bool) -> tuple[dic
     regions = {name: found[name] for name in cg.functions if name in found}
     seen = {*used, *chain.from_iterable(map(cg.func_outputs, regions))}
     return regions, [token for token in cg.tokens if token in seen]
+
+
+def _runs_exactly(cg: CompGraph) -> dict[str, Region]:
+    """Return where functions stand of a whole graph, but for those that stand before a switch and run for a part of it.
+
+    A function that several branches need, and not all, stands before the switch, while a runner may leave it out.
+    """
+    regions, _ = _regions(cg, cg.sink_tokens, True)
+    needed: dict[str, set[Region | None]] = {token: {()} for token in cg.sink_tokens}
+    exact: dict[str, Region] = {}
+    for name in reversed(tuple(cg.functions)):
+        made = cg.func_outputs(name)
+        here = _joined(cg, set().union(*(needed.get(token, set()) for token in made)) if made else {()})
+        if here == {regions[name]}:
+            exact[name] = regions[name]
+        for number, token in enumerate(cg.func_inputs(name)):
+            is_branch = name in cg.switches and number
+            branch = (*exact[name], (name, token)) if name in exact else None
+            needed.setdefault(token, set()).update({branch} if is_branch else here)
+    return exact
+
+
+def _joined(cg: CompGraph, regions: set[Region | None]) -> set[Region | None]:
+    """Return the fewest regions that are the same together: all branches of a switch are the region around it."""
+    while True:
+        known = [region for region in regions if region]
+        inner = {region for region in known if any(region[:depth] in regions for depth in range(len(region)))}
+        whole = {
+            region[:-1]
+            for region in known
+            if regions >= {(*region[:-1], (region[-1][0], other)) for other in cg.func_inputs(region[-1][0])[1:]}
+        }
+        if not inner and whole <= regions:
+            return regions
+        regions = (regions - inner) | whole
 
 
 def _common(regions: Sequence[Region]) -> Region:
@@ -231,6 +310,12 @@ class _Function:
         By hyperparameter, the expression of its value.
     variables
         By token.
+    taken
+        The names that no variable may have.
+    left
+        By pipeline with state, the variable of the state that it has left.
+    states
+        What is kept for the next call.
     """
 
     def __init__(
@@ -238,7 +323,14 @@ class _Function:
     ) -> None:
         self.module, self.name, self.cg, self.where = module, name, cg, where
         self.returns = cg.sink_tokens if wanted is None else wanted
-        self.regions, tokens = _regions(cg, self.returns, wanted is None)
+        part = cg if wanted is None or not states_of(cg) else subgraph(cg, wanted)
+        delays = [*part.delays]
+        keepers = [name for name, function in part.functions.items() if _has_state(function)]
+        made = self._made_for_states(delays, keepers)
+        exact = _runs_exactly(cg) if made else {}
+        roots = [token for token, maker in made.items() if not exact.get(maker)]
+        self.regions, tokens = _regions(cg, (*self.returns, *roots), wanted is None)
+        self._refuse_some_branches(made.values(), exact)
         missing = [each for each in cg.placeholders if each in self.regions]
         if missing:
             raise PlaceholderNeeded(missing)
@@ -246,8 +338,45 @@ class _Function:
         self.switches = {each: self._keys(each, switch) for each, switch in switches.items() if switch is not None}
         self.calls = {each: self._call(each) for each in self.regions if each not in self.switches}
         self.defaults = {token: self._default(token, value) for token, value in values.items() if token in tokens}
-        self.variables = self._named(tokens)
+        self.defaults |= {
+            previous: self._default(previous, cg.delays[previous].initial, "The initial value of", _NO_INITIAL)
+            for previous in delays
+        }
+        keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
+        self.taken = {name for source in {*self.calls.values(), *keys} for name in names_in(source)} | {"ValueError"}
+        self.variables = self._named([token for token in cg.tokens if token in {*tokens, *delays}])
+        self.left: dict[str, str] = {}
+        self.states = [*self._states(delays, keepers)]
         module.texts.append(self._text())
+
+    def _made_for_states(self, delays: Iterable[str], keepers: Iterable[str]) -> dict[str, str]:
+        """Return tokens that are there whenever the state is left, with the function that makes each, "" for none."""
+        kept = [self.cg.delays[previous].token for previous in delays]
+        made = {token: self.cg.digraph.producer.get(token, "") for token in kept}
+        return made | {self.cg.func_outputs(name)[0]: name for name in keepers}
+
+    def _refuse_some_branches(self, makers: Iterable[str], exact: Mapping[str, Region]) -> None:
+        """Refuse functions with state that do not run exactly where they stand."""
+        for name in dict.fromkeys(filter(None, makers)):
+            if name not in exact or exact[name] != self.regions.get(name):
+                self.module.gathered.refusals.append(f"Function {name!r}{self.where} {_SOME_BRANCHES}")
+
+    def _states(self, delays: Iterable[str], keepers: Iterable[str]) -> Iterator[_State]:
+        """Give what is kept for the next call."""
+        for previous in delays:
+            token = self.cg.delays[previous].token
+            maker = self.cg.digraph.producer.get(token, "")
+            yield self._state(self.variables[previous], self.defaults[previous], maker, self.variables[token])
+        for name in keepers:
+            self.left[name] = left = self._variable(f"{name}_state")
+            for inner in self.module.pipelines[id(without_nodes(self.cg.functions[name]))].states:
+                parameter = self._variable(f"{name}_{inner.parameter}")
+                after = f'{left}["{inner.parameter}"]'
+                yield self._state(parameter, inner.default, name, after, inner.parameter)
+
+    def _state(self, parameter: str, default: str, maker: str, after: str, inner: str = "") -> _State:
+        following = self._variable(f"next_{parameter}") if self.regions.get(maker) else ""
+        return _State(parameter, default, maker, after, following, inner)
 
     def _call(self, name: str) -> str:
         """Return the expression of a function; of a pipeline, the name of the function that it becomes."""
@@ -255,10 +384,10 @@ class _Function:
         if not is_plain_pipeline(function):
             return module.expression(f"Function {name!r}{self.where}", function, _NO_EXPRESSION, name)
         if id(function) not in module.pipelines:
-            module.pipelines[id(function)] = inner = module.gathered.free_name(function.name)
-            where = f" of pipeline {function.name!r}"
-            _Function(module, inner, function.cg, function.runner.hyperparameters, None, where)
-        return module.pipelines[id(function)]
+            inner, where = module.gathered.free_name(function.name), f" of pipeline {function.name!r}"
+            made = _Function(module, inner, function.cg, function.runner.hyperparameters, None, where)
+            module.pipelines[id(function)] = made
+        return module.pipelines[id(function)].name
 
     def _keys(self, name: str, switch: Switch) -> dict[str, list[str]]:
         """Return the expressions of the values by which a switch chooses each token."""
@@ -268,9 +397,9 @@ class _Function:
             found.setdefault(token, []).append(source)
         return found
 
-    def _default(self, token: str, value: Any) -> str:
-        """Return the expression of a hyperparameter's value: a short literal or name, or the constant that holds it."""
-        source = self.module.expression(f"Hyperparameter {token!r}{self.where}", value, _NO_VALUE)
+    def _default(self, token: str, value: Any, what: str = "Hyperparameter", reason: str = _NO_VALUE) -> str:
+        """Return the expression of a parameter's value: a short literal or name, or the constant that holds it."""
+        source = self.module.expression(f"{what} {token!r}{self.where}", value, reason)
         is_simple = literal_source(value) or source.replace(".", "").isidentifier()
         if is_simple and len(source) <= _LONGEST:
             return source
@@ -278,29 +407,38 @@ class _Function:
 
     def _text(self) -> str:
         """Return the function."""
-        variables = self.variables
+        variables, states = self.variables, self.states
         sources = [token for token in self.cg.source_tokens if token in variables]
         given = [variables[token] for token in sources if token not in self.defaults]
         named = [f"{variables[token]}={self.defaults[token]}" for token in sources if token in self.defaults]
+        named += [f"{each.parameter}={each.default}" for each in states if each.inner]
         given += ["*", *named] if named else []
         head = f"def {self.name}({', '.join(given)}):"
         lines = [head] if len(head) <= LINE else [f"def {self.name}(", *(f"    {each}," for each in given), "):"]
-        lines += [*self._docstring([*sources, *self.returns]), *self._lines(())]
+        lines += self._docstring([*sources, *self.returns])
+        lines += [f"    {each.following} = {each.parameter}" for each in states if each.following]
+        lines += self._lines(())
         returned = ", ".join(variables[token] for token in self.returns)
+        is_several = len(self.returns) != 1
+        if states:
+            after = ", ".join(f'"{each.parameter}": {each.following or each.after}' for each in states)
+            returned = f"{f'({returned})' if is_several else returned}, {{{after}}}"
         if returned:
-            is_line = len(self.returns) == 1 or len(returned) + len("    return ") <= LINE
+            is_line = not (is_several or states) or len(returned) + len("    return ") <= LINE
             lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")
         return "\n".join(lines)
 
+    def _variable(self, wanted: str) -> str:
+        """Return a variable that is not taken, and take it."""
+        found = identifier_of(wanted, self.taken.__contains__)
+        self.taken.add(found)
+        return found
+
     def _named(self, tokens: Iterable[str]) -> dict[str, str]:
         """Return a variable for each token that hides nothing of the module; names that can stay come first."""
-        keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
-        taken = {name for source in {*self.calls.values(), *keys} for name in names_in(source)} | {"ValueError"}
-        found: dict[str, str] = {}
-        for token in sorted(tokens, key=lambda token: not is_identifier(token) or token in taken):
-            found[token] = identifier_of(token, taken.__contains__)
-            taken.add(found[token])
-        return found
+        reserved = frozenset(self.taken)
+        in_order = sorted(tokens, key=lambda token: not is_identifier(token) or token in reserved)
+        return {token: self._variable(token) for token in in_order}
 
     def _lines(self, region: Region) -> Iterator[str]:
         """Give the lines of the functions of a region, and of the branches in it."""
@@ -308,16 +446,22 @@ class _Function:
             if name in self.switches:
                 yield from self._switch(name, region)
             else:
-                arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
-                yield from laid_out(f"{self.calls[name]}({arguments})", len(region) + 1, self._targets(name))
+                arguments = [self.variables[token] for token in self.cg.func_inputs(name)]
+                own = [state for state in self.states if state.maker == name]
+                arguments += [f"{state.inner}={state.parameter}" for state in own if state.inner]
+                yield from laid_out(f"{self.calls[name]}({', '.join(arguments)})", len(region) + 1, self._targets(name))
+                pad = "    " * (len(region) + 1)
+                yield from (f"{pad}{state.following} = {state.after}" for state in own if state.following)
 
     def _targets(self, name: str) -> str:
         """Return what stands before the value of a function."""
         targets = [self.variables[token] for token in self.cg.func_outputs(name)]
-        if not targets:
-            return ""
         is_tuple_of_one = len(targets) == 1 and not self.cg.has_single_output(name)
-        return f"({targets[0]},) = " if is_tuple_of_one else f"{', '.join(targets)} = "
+        several = f"({targets[0]},)" if is_tuple_of_one else ", ".join(targets)
+        if name in self.left:
+            value = several if len(targets) == 1 else f"({several})" if targets else "_"
+            return f"{value}, {self.left[name]} = "
+        return f"{several} = " if targets else ""
 
     def _switch(self, name: str, region: Region) -> Iterator[str]:
         depth, pad, keyword = len(region) + 1, "    " * (len(region) + 1), "if"
@@ -339,6 +483,8 @@ class _Function:
         if len(returned) > LINE - len('    """Return ."""'):
             returned = f"{len(self.returns)} values"
         summary = f"Return {returned}." if returned else "Run."
+        if self.states:
+            summary = f"{summary[:-1]}, and the state for the next call." if returned else "Return None, and the state."
         other = [token for token in dict.fromkeys(shown) if self.variables[token] != token]
         if not other:
             return [f'    """{summary}"""']

@@ -160,8 +160,9 @@ def _without_superfluous(program: Program, values: Sequence[Any]) -> bytes:
     wanted = bytearray(b"\1") * len(program.steps)
     read = {index: program.read_by(program.steps[index], values) for index in program.switches}
     for step in reversed(program.steps):
-        readers = [(index, slot) for slot in step.outputs for index in program.consumers[slot]]
-        makes_sink = not all(program.consumers[slot] for slot in step.outputs)
+        made = [slot for slot in step.outputs if slot < len(program.slots)]  # behind them is the state of pipelines
+        readers = [(index, slot) for slot in made for index in program.consumers[slot]]
+        makes_sink = not all(program.consumers[slot] for slot in made)
         is_read = any(wanted[index] and slot in read.get(index, (slot,)) for index, slot in readers)
         if readers and not makes_sink and not is_read:
             wanted[step.place] = 0

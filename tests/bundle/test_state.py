@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.batch.cache import graph_fingerprint
 from epypes.bundle import verify
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
+from epypes.bundle.replay import replay
 from epypes.bundle.settings import read_settings
 from epypes.bundle.writeback import write_back
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers
@@ -176,16 +178,19 @@ def test_a_bundle_with_state_is_promoted_again_to_the_same_text(promoted, tmp_pa
 
 
 def test_another_delay_or_initial_value_is_another_bundle(names, tmp_path):
-    digests = set()
+    digests, fingerprints, texts = set(), set(), set()
     for number, initial in enumerate((0.0, -0.0, float("nan"), 0)):
         cg = ep.CompGraph({"smooth": names["scale"]}, {"smooth": (("x", "before"), "y")})
         runner = ep.CompGraphRunner(ep.delay(cg, "y", "before", initial))
         runner.run(x=1)
         bundle = ep.promote(runner, tmp_path / f"{number}")
         digests.add(bundle.digest)
+        text = (bundle.path / "pipeline.py").read_text()
+        texts.add(re.sub(r"initial=.*\)\n|graph \d", "", text))
+        fingerprints.add((graph_fingerprint(runner.cg).code, graph_fingerprint(runner.cg).state))
         ((key, value),) = ep.load(bundle.path).state.items()
         assert (key, repr(value)) == ("before", repr(initial))
-    assert len(digests) == 4
+    assert (len(digests), len(fingerprints), len(texts)) == (4, 4, 1), "one line of the module differs"
 
 
 def test_states_that_module_and_settings_name_otherwise_are_refused(promoted, tmp_path):
@@ -251,6 +256,19 @@ def test_a_state_that_is_not_the_recorded_one_is_found_with_its_token(copied, si
     write_manifest(copied)
     with pytest.raises(ReplayDiffers, match=f"sample 001, token '{token}': .*kept as '"):
         verify(copied)
+
+
+def test_a_replay_goes_on_from_what_it_has_left_and_not_from_what_was_recorded(copied):
+    first, second = (copied / "samples" / f"{name}.npz" for name in ("000", "001"))
+    sample, following = read_sample(first), read_sample(second)
+    for side in (sample.state_after, following.state):
+        side["total"] = side["total"] + 1.0
+    save_sample(first, **sample._asdict())
+    save_sample(second, **following._asdict())
+    found = replay(read_bundle(copied, compare=False)).differences
+    assert [(entry.sample, entry.token) for entry in found] == [("000", "sum")]
+    found = replay(read_bundle(copied, compare=False), twice=True).differences
+    assert ("001", "y") in [(entry.sample, entry.token) for entry in found], "alone it begins as recorded"
 
 
 def test_a_sample_without_the_states_of_the_settings_is_refused(copied):
@@ -337,6 +355,18 @@ def test_a_switch_a_source_token_and_a_delay_of_a_delay_leave_what_they_left_in_
     left = [after["before"] for _, after in states(bundle)]
     assert left == [4.0, 4.0, 3.0, 3.0, 4.5]
     assert bundle.settings.states == {"before": "smoothed", "one_before": "x", "two_before": "one_before"}
+
+
+def test_a_rerun_that_chose_another_branch_is_no_sample_since_no_run_leaves_its_state(names, tmp_path):
+    cg = smoothing(names) | ep.CompGraph({"negated": names["negated"]}, {"negated": ("x", "negative")})
+    cg |= ep.switch("choose", {"on": "y", "off": "negative"}, by="mode", output="chosen")
+    runner = ep.CompGraphRunner(cg, {"k": 0.5, "by": 1, "mode": "on"})
+    runner.run(x=4.0)
+    runner.rerun(mode="off")
+    with pytest.raises(PromotionRefused, match=r"left for 'before' what function 'smooth' made .*runner\.run|run\(x="):
+        ep.promote(runner, tmp_path / "switch")
+    runner.run(x=2.0)
+    ep.promote(runner, tmp_path / "switch")
 
 
 def test_an_initial_value_that_no_run_takes_or_no_expression_makes_is_refused_with_the_way_out(names, tmp_path):

@@ -426,3 +426,106 @@ def test_long_constants_of_the_notebook_stand_as_they_were():
     )
     text = ep.to_source(ep.CompGraph({"f": names["f"]}, {"f": ("x", "y")}))
     assert executed(text)(0) == names["f"](0)
+
+
+# -- state between calls ----------------------------------------------------------------------------------------------
+
+STATE_CELL = """
+def mix(x, before, k):
+    return x if before is None else k * x + (1 - k) * before
+
+
+def double(value):
+    return 2 * value
+
+
+def negative(value):
+    return -value
+
+
+def step(x, before):
+    return x - before
+"""
+
+
+def with_state():
+    """Return graphs with state by what is special about them, with payloads of a series."""
+    names = notebook(STATE_CELL)
+    mix, double, negative, step = (names[name] for name in ("mix", "double", "negative", "step"))
+    io = {"mix": (("x", "before", "k"), "mixed"), "double": ("mixed", "y")}
+    plain = ep.delay(ep.CompGraph({"mix": mix, "double": double}, io), "mixed", "before")
+    inner = ep.Pipeline("inner", plain, {"k": 0.5})
+    middle = ep.CompGraph({"inner": inner, "n": negative}, {"inner": ("x", "y"), "n": ("x", "m")})
+    two = ep.CompGraph({"a": step, "b": negative}, {"a": (("x", "ago"), "y"), "b": ("last", "z")})
+    nested = ep.CompGraph(
+        {"middle": ep.Pipeline("middle", middle), "again": inner, "step": step},
+        {"middle": ("x", ("y", "m")), "again": ("m", "v"), "step": (("v", "v before"), "w")},
+    )
+    chosen = ep.switch("choose", {"on": "y", "off": "other"}, by="mode", output="chosen")
+    both = ep.switch("choose", {"on": "u", "off": "v"}, by="mode", output="chosen")
+    other = ep.CompGraph({"other": negative}, {"other": ("x", "other")})
+    branches = ep.CompGraph({"u": double, "v": negative}, {"u": ("y", "u"), "v": ("y", "v")})
+    in_branch = ep.CompGraph({"inner": inner, "other": negative}, {"inner": ("x", "y"), "other": ("x", "other")})
+    series = [{"x": x} for x in (4.0, 2.0, 8.0)]
+    modes = [{"x": x, "mode": mode} for x, mode in ((4.0, "on"), (100.0, "off"), (2.0, "on"), (8.0, "off"))]
+    return {
+        "a token": (plain, series),
+        "a payload, and a delay of a delay": (ep.delay(ep.delay(two, "x", "last", 0), "last", "ago", 1), series),
+        "pipelines in pipelines": (ep.delay(nested, "v", "v before", 0), series),
+        "a branch": (plain | other | chosen, modes),
+        "both branches": (plain | branches | both, modes),
+        "a pipeline in a branch": (in_branch | chosen, modes),
+    }
+
+
+@pytest.mark.parametrize("what", [*with_state()])
+def test_a_graph_with_state_takes_and_returns_it(what):
+    cg, payloads = with_state()[what]
+    values = {"k": 0.5} if "k" in cg.tokens else {}
+    runner = ep.CompGraphRunner(cg, values)
+    text = ep.to_source(cg, values)
+    assert not ruff_says(text)
+    names, state = {}, {}
+    exec(text, names)
+    function = names["run_graph"]
+    for payload in payloads:
+        run = runner.run(**payload)
+        value, state = function(*(payload[token] for token in runner.free_source_tokens), **state)
+        expected = tuple(run[token] for token in cg.sink_tokens)
+        assert (value if len(expected) > 1 else (value,)) == expected
+        assert [*state.values()] == [*run.state.values()]
+
+
+def test_state_reads_as_a_colleague_would_have_written_it():
+    cg, _ = with_state()["a token"]
+    assert ep.to_source(cg, {"k": 0.5}, name="track").endswith('''
+def track(x, *, before=None, k=0.5):
+    """Return y, and the state for the next call."""
+    mixed = mix(x, before, k)
+    y = double(mixed)
+    return y, {"before": mixed}
+''')
+    text = ep.to_source(cg, {"k": 0.5}, returns=["mixed", "y"])
+    assert 'return (mixed, y), {"before": mixed}' in text
+    cg, _ = with_state()["a branch"]
+    text = ep.to_source(cg, {"k": 0.5})
+    assert "    next_before = before\n    if mode == " in text
+    assert "        next_before = mixed\n" in text
+    unrelated = ep.to_source(cg, {"k": 0.5}, returns="other")
+    assert "before" not in unrelated
+    assert "state" not in unrelated
+
+
+def test_state_of_what_some_branches_need_is_refused_and_so_is_an_initial_value_without_an_expression():
+    names = notebook(STATE_CELL)
+    cg, _ = with_state()["a token"]
+    branches = ep.CompGraph(
+        {"u": names["double"], "v": names["negative"], "w": names["double"]},
+        {"u": ("y", "u"), "v": ("y", "v"), "w": ("x", "w")},
+    )
+    cg |= branches | ep.switch("choose", {1: "u", 2: "v", 3: "w"}, by="mode", output="chosen")
+    with pytest.raises(SourceRefused, match="Function 'mix' makes what the next run begins with, and only some"):
+        ep.to_source(cg, {"k": 0.5})
+    cg = ep.CompGraph({"step": names["step"]}, {"step": (("x", "before"), "y")})
+    with pytest.raises(SourceRefused, match="The initial value of 'before' is of type object.*Begin with None"):
+        ep.to_source(ep.delay(cg, "y", "before", object()))

@@ -231,6 +231,17 @@ def test_the_state_of_a_nested_pipeline_belongs_to_the_run_of_the_outer_graph(ne
     assert runner.run(x=1)["z"] == 12
 
 
+def test_a_switch_that_leaves_a_nested_pipeline_out_keeps_its_state():
+    cg = ep.CompGraph(
+        {"inner": ep.Pipeline("inner", smoothing(), {"k": 0.5, "by": 1}), "raw": lambda x: -x},
+        {"inner": ("x", "y"), "raw": ("x", "negative")},
+    )
+    cg |= ep.switch("choose", {"on": "y", "off": "negative"}, by="mode", output="chosen")
+    runner = ep.CompGraphRunner(cg)
+    assert [runner.run(x=x, mode=mode)["chosen"] for x, mode in ((4, "on"), (100, "off"), (2, "on"))] == [4, -100, 3]
+    assert dict(runner.run(x=100, mode="off").state) == {"inner.before": 3}
+
+
 def test_a_nested_pipeline_with_several_outputs_and_one_inside_it():
     def split(x, before):
         return x + before, x - before
