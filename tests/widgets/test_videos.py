@@ -135,7 +135,7 @@ def test_frames_that_are_looked_at_in_turn_are_one_entry_of_the_history(
     before = len(panel.history)
     for index in (5, 9, 14):
         panel._screen.view._handle(None, {"kind": "move", "values": {}, "places": {}, "image": index}, ())
-    until(lambda: panel._session.image == 14)
+    until(lambda: panel._session.image == 14 and not panel._worker.is_pending("compute"))
     assert len(panel.history) == before
     panel.undo()
     assert panel.history["image"].tolist()[-1] == 14
