@@ -25,7 +25,7 @@ from epypes.bundle.objects import without_nodes
 from epypes.bundle.settings import states_of
 from epypes.bundle.slice import Slice, gather
 from epypes.errors import PlaceholderNeeded, SourceRefused
-from epypes.graph import CompGraph, Switch, as_switch, subgraph
+from epypes.graph import CompGraph, Switch, as_switch, needed_for
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
@@ -323,9 +323,9 @@ class _Function:
     ) -> None:
         self.module, self.name, self.cg, self.where = module, name, cg, where
         self.returns = cg.sink_tokens if wanted is None else wanted
-        part = cg if wanted is None or not states_of(cg) else subgraph(cg, wanted)
-        delays = [*part.delays]
-        keepers = [name for name, function in part.functions.items() if _has_state(function)]
+        found, needed = (set(cg.tokens), set(cg.functions)) if wanted is None else needed_for(cg, wanted)
+        delays = [previous for previous in cg.delays if previous in found]
+        keepers = [name for name, function in cg.functions.items() if name in needed and _has_state(function)]
         made = self._made_for_states(delays, keepers)
         exact = _runs_exactly(cg) if made else {}
         roots = [token for token, maker in made.items() if not exact.get(maker)]
@@ -422,7 +422,7 @@ class _Function:
         is_several = len(self.returns) != 1
         if states:
             after = ", ".join(f'"{each.parameter}": {each.following or each.after}' for each in states)
-            returned = f"{f'({returned})' if is_several else returned}, {{{after}}}"
+            returned = f"{f'({returned})' if len(self.returns) > 1 else returned or None}, {{{after}}}"
         if returned:
             is_line = not (is_several or states) or len(returned) + len("    return ") <= LINE
             lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")

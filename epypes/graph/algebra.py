@@ -161,7 +161,25 @@ def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
     ['f']
     """
     _require_graph("subgraph()", cg)
-    pending = list(names_of("targets", targets))
+    found, needed = needed_for(cg, names_of("targets", targets))
+    parts = cg._parts()
+    for token in [token for token in parts.delays if token not in found]:
+        del parts.delays[token]
+    for name in [name for name in parts.functions if name not in needed]:
+        del parts.functions[name], parts.func_io[name]
+        parts.groups.pop(name, None)
+    return CompGraph._of(parts)
+
+
+def needed_for(cg: CompGraph, targets: Iterable[str]) -> tuple[set[str], set[str]]:
+    """Return the tokens and the functions that tokens need, as ``subgraph`` does.
+
+    Raises
+    ------
+    UnknownName
+        The graph has no such token.
+    """
+    pending = list(targets)
     for token in pending:
         cg.require_token(token)
     needed: set[str] = set()
@@ -175,13 +193,7 @@ def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
             read.extend(cg.digraph.inputs[function])
         pending.extend(other for other in read if other not in found)
         found.update(read)
-    parts = cg._parts()
-    for token in [token for token in parts.delays if token not in found]:
-        del parts.delays[token]
-    for name in [name for name in parts.functions if name not in needed]:
-        del parts.functions[name], parts.func_io[name]
-        parts.groups.pop(name, None)
-    return CompGraph._of(parts)
+    return found, needed
 
 
 def rename(

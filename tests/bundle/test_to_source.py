@@ -511,6 +511,8 @@ def track(x, *, before=None, k=0.5):
     text = ep.to_source(cg, {"k": 0.5})
     assert "    next_before = before\n    if mode == " in text
     assert "        next_before = mixed\n" in text
+    sink = ep.CompGraph({"show": print}, {"show": (("x", "last"), None)})
+    assert 'return None, {"last": x}' in ep.to_source(ep.delay(sink, "x", "last"))
     unrelated = ep.to_source(cg, {"k": 0.5}, returns="other")
     assert "before" not in unrelated
     assert "state" not in unrelated

@@ -13,6 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
+from epypes.errors import SourceRefused
+from epypes.graph import needed_for
 
 pytestmark = pytest.mark.slow  # many graphs are written and run
 
@@ -130,3 +132,38 @@ def test_any_graph_written_as_a_function_computes_the_same(drawn, data):
     expected = tuple(run[token] for token in returned)
     assert repr(made) == repr(expected[0] if len(expected) == 1 else expected or None)
     assert logged == LOG
+
+
+@pytest.mark.fuzz
+@given(graphs(), st.data())
+def test_any_graph_with_state_takes_and_returns_what_a_series_of_runs_leaves(drawn, data):
+    cg, hparams, choices = drawn
+    free = [token for token in cg.source_tokens if token not in {**hparams, **choices}]
+    previous = data.draw(st.lists(st.sampled_from(free), min_size=1, max_size=3, unique=True)) if free else []
+    for token in previous:
+        others = [other for other in cg.tokens if other not in {token, *hparams, *choices}]
+        cg = ep.delay(cg, data.draw(st.sampled_from(others)), token, data.draw(st.integers(0, 9))) if others else cg
+    wanted = data.draw(st.none() | st.lists(st.sampled_from(cg.sink_tokens), min_size=1)) if cg.sink_tokens else None
+    try:
+        text = ep.to_source(cg, hparams, returns=wanted)
+    except SourceRefused as refused:
+        if not all("only some branches of switches need it" in reason for reason in refused.reasons):
+            raise
+        return
+    names: dict = {}
+    exec(compile(text, "straight", "exec"), names)
+    runner, state = ep.CompGraphRunner(cg, hparams), {}
+    found = needed_for(cg, wanted)[0] if wanted else {*cg.tokens}
+    taken, left = ([token for token in tokens if token in found] for tokens in (runner.free_source_tokens, cg.delays))
+    for number in range(4):
+        payload = {
+            token: data.draw(st.sampled_from(choices[token])) if token in choices else number
+            for token in runner.free_source_tokens
+        }
+        run, returned = runner.run(**payload), wanted or cg.sink_tokens
+        LOG.clear()
+        made = names["run_graph"](*(payload[token] for token in taken), **state)
+        made, state = made if left else (made, {})
+        expected = tuple(run[token] for token in returned)
+        assert repr(made) == repr(expected[0] if len(expected) == 1 else expected or None)
+        assert [*map(repr, state.values())] == [repr(run.state[token]) for token in left]
