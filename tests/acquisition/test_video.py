@@ -91,14 +91,15 @@ def test_a_frame_that_is_not_there_is_named(mp4):
 
 
 def test_a_file_that_says_so_is_turned(mp4):
-    content = mp4.read_bytes()
+    content, upright_frames = mp4.read_bytes(), captured(mp4)
     upright = struct.pack(">9I", 0x10000, 0, 0, 0, 0x10000, 0, 0, 0, 0x40000000)
     turned = struct.pack(">9I", 0, 0x10000, 0, 0xFFFF0000, 0, 0, 0, 0, 0x40000000)
     at = content.index(upright, content.index(b"tkhd"))
     mp4.write_bytes(content[:at] + turned + content[at + len(turned) :])
     video = ep.video(mp4)
     assert video[0].shape == (WIDTH, HEIGHT, 3)
-    assert np.array_equal(video[7], captured(mp4)[7])
+    # OpenCV 4.11 does not turn it.
+    assert np.array_equal(video[7], np.rot90(upright_frames[7], -1))
 
 
 def test_images_are_read_only_and_a_frame_in_use_is_one_array(mp4):
@@ -153,14 +154,16 @@ def test_a_file_that_has_changed_is_not_read_on(mp4, tmp_path):
 # What is damaged or cut off
 
 
-def test_an_avi_that_was_cut_off_is_read_as_far_as_it_goes(avi):
-    avi.write_bytes(avi.read_bytes()[: avi.stat().st_size * 6 // 10])
+@pytest.mark.parametrize("part", [0.3, 0.5, 0.6])
+def test_an_avi_that_was_cut_off_is_read_as_far_as_it_goes(avi, part):
+    whole = captured(avi)
+    avi.write_bytes(avi.read_bytes()[: int(avi.stat().st_size * part)])
     with pytest.warns(
         UserWarning, match=r"'.*belt\.avi' was cut off or is damaged: it has \d+ of 40 frames\. These are used\."
     ):
         video = ep.video(avi)
-    assert 15 < len(video) < 30
-    assert [number_in(image) for image in video] == list(range(len(video)))
+    assert part * COUNT - 6 < len(video) < part * COUNT
+    assert all(np.array_equal(image, expected) for image, expected in zip(video, whole, strict=False))
 
 
 def test_an_mkv_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
@@ -242,7 +245,12 @@ def test_a_loop_over_a_camera_does_not_disturb_what_is_read(mp4):
     assert number_in(camera.read()) == 1
 
 
-def test_a_loop_keeps_to_a_pace_only_if_it_was_asked_for(mp4):
+def test_a_loop_does_not_keep_to_the_pace_of_the_recording(tmp_path):
+    slow = write_video(tmp_path / "slow.avi", 3, "MJPG", fps=0.01)
+    assert [frame.time_s for frame in ep.camera(slow)] == pytest.approx([0, 100, 200])
+
+
+def test_a_loop_keeps_to_a_pace_that_was_asked_for(mp4):
     camera, seen = ep.camera(mp4, fps=1 / 3600), threading.Event()
 
     def loop():

@@ -119,7 +119,6 @@ def test_a_drag_ends_with_its_last_frame_and_is_one_entry_of_the_history(
 def test_the_slider_can_be_read_in_both_themes(notebook: Notebook, panel: PanelOnScreen) -> None:
     for colours in notebook.each_theme():
         assert unreadable(panel.page, ".epypes-panel") == [], colours
-        panel.page.locator(".epypes-panel").first.screenshot(path=f"/tmp/w/vid/panel_{colours}.png")
 
 
 def test_a_cell_that_runs_again_goes_on_with_the_frame(notebook: Notebook, panel: PanelOnScreen) -> None:

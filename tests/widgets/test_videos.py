@@ -79,7 +79,7 @@ def test_a_panel_starts_on_the_first_frame_and_goes_to_any(runner: ep.CompGraphR
 def test_the_view_gets_the_numbers_of_the_frames_and_no_thumbnails(runner: ep.CompGraphRunner, video: Path) -> None:
     panel = tune(runner, images=ep.video(video)[4:20:2])
     panel.wait(60)
-    assert setup(panel)["video"] == {"name": "belt.avi", "numbers": {"start": 4, "step": 2, "count": 8}}
+    assert setup(panel)["frames"] == {"name": "belt.avi", "numbers": {"start": 4, "step": 2, "count": 8}}
     assert setup(panel)["images"] == []
     go_to(panel, 3)
     content = panel._screen.view.frames.newest.content
@@ -89,7 +89,7 @@ def test_the_view_gets_the_numbers_of_the_frames_and_no_thumbnails(runner: ep.Co
     assert "belt.avi #10, 0.400 s" in panel._static_html()
     panel.close()
     other = tune(runner)
-    assert setup(other)["video"] is None
+    assert setup(other)["frames"] is None
     other.close()
 
 
@@ -135,7 +135,7 @@ def test_frames_that_are_looked_at_in_turn_are_one_entry_of_the_history(
     before = len(panel.history)
     for index in (5, 9, 14):
         panel._screen.view._handle(None, {"kind": "move", "values": {}, "places": {}, "image": index}, ())
-    until(lambda: panel._session.image == 14)
+    until(lambda: panel._session.image == 14 and not panel._worker.is_pending("compute"))
     assert len(panel.history) == before
     panel.undo()
     assert panel.history["image"].tolist()[-1] == 14
