@@ -91,3 +91,11 @@ def test_the_big_picture_has_the_colours_that_the_annotations_say() -> None:
         picture = np.asarray(Image.open(io.BytesIO(make_frame(run, token, 1, Shown(token)).buffers[0])))
         strongest[token] = int(picture.reshape(-1, 3).mean(axis=0).argmax())
     assert strongest == {"image": 0, "red": 0, "unsaid": 2}
+
+
+def test_a_frame_names_the_order_of_colours_and_whether_it_is_assumed(runner: ep.CompGraphRunner) -> None:
+    run = red_runner().run(image=red_image())
+    assert {token: pictures(run, token)[0]["order"] for token in run} == {
+        "image": "rgb", "red": "rgb", "unsaid": "bgr, assumed",
+    }  # fmt: skip
+    assert pictures(runner.rerun(threshold=50), "mask")[0]["order"] == "", "it has one channel"
