@@ -101,8 +101,6 @@ def _use_of(function: object, depth: int) -> ColourUse:
     library, name = library_name(full_name(plain))
     if library == "skimage" or not isinstance(plain, FunctionType):
         return _use_of_library(library, name)
-    if "__wrapped__" in vars(plain):  # a decorator may convert before it calls
-        return _NOTHING
     known = _READ.get(plain)
     if known is None and depth:
         _READ[plain] = _NOTHING  # for a function that calls itself

@@ -29,6 +29,8 @@ from epypes.bundle.settings import (
     unwritable,
     write_settings,
 )
+from epypes.errors import BundleError
+from epypes.graph import ColourOrder
 
 
 class Method(enum.Enum):
@@ -73,6 +75,31 @@ def bits(value):
     if type(value) is dict:
         return dict, [(bits(key), bits(item)) for key, item in value.items()]
     return type(value), value
+
+
+def test_the_orders_of_colours_come_back_with_what_says_them(tmp_path):
+    path = tmp_path / "pipeline.toml"
+    colours = {"x": ColourOrder("rgb", "gray"), "y": ColourOrder("bgr")}
+    write_settings(path, Settings("b", ("x",), ("y",), {}, colours), CG)
+    assert (found := read_settings(path)).colours == colours
+    assert (found.order("x"), found.order("y"), found.order("z"), found.rgb) == ("rgb", "bgr", "bgr", ("x",))
+    assert [found.colour(token).is_assumed for token in ("x", "y", "z")] == [False, True, True]
+    assert 'order = "bgr"  # assumed\n' in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('order = "rgb"', 'order = "rbg"', "the order of the colours of 'x' is 'rbg', not bgr or rgb"),
+        ("[ports]", '[ports]\nrgb = ["x"]', "its orders of colours stand under .ports., where an older EPypes"),
+    ],
+)
+def test_orders_of_colours_that_cannot_be_read_are_refused(tmp_path, old, new, text):
+    path = tmp_path / "pipeline.toml"
+    write_settings(path, Settings("b", ("x",), ("y",), {}, {"x": ColourOrder("rgb", "gray")}), CG)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(BundleError, match=text):
+        read_settings(path)
 
 
 @pytest.mark.slow

@@ -110,3 +110,11 @@ def test_where_nothing_is_found_a_text_takes_the_place_of_the_last_picture() -> 
     ]
     assert (made.content["ran"], made.content["reused"], made.content["skipped"], made.buffers) == (1, 0, 1, ())
     assert made.content["histogram"] is None
+
+
+def test_a_frame_names_the_order_of_colours_and_whether_it_is_assumed(runner: ep.CompGraphRunner) -> None:
+    run = red_runner().run(image=red_image())
+    assert {token: pictures(run, token)[0]["order"] for token in run} == {
+        "image": "rgb", "red": "rgb", "unsaid": "bgr, assumed",
+    }  # fmt: skip
+    assert pictures(runner.rerun(threshold=50), "mask")[0]["order"] == "", "it has one channel"

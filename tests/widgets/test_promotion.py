@@ -63,7 +63,11 @@ def test_a_bundle_is_written_and_said_to_be_identical(told: Told, edges: ep.Comp
     target = tmp_path / "edges"
     outcome = told.promoted(edges, target, ["edges"])
     assert outcome == Outcome(
-        "done", f"Promoted to {target}: output edges; 1 sample replayed in a fresh process, identical.", str(target)
+        "done",
+        f"Promoted to {target}: output edges; 1 sample replayed in a fresh process, identical.\n"
+        "No function says the order of the colours of 'image': bgr is assumed. If it is rgb, annotate a parameter: "
+        'Annotated[np.ndarray, ep.Image(order="rgb")].',
+        str(target),
     )
     assert [each.state for each in told.outcomes] == ["running", "done"]
     assert threading.current_thread() not in told.threads

@@ -174,11 +174,13 @@ def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -
             runner.cg, runner.hyperparameters, guard=runner.guard, check_mutation=runner.check_mutation
         )
         own.run(**{token: last[token] for token in own.free_source_tokens})
-    bundle = promote(own, Path(to.strip()).expanduser(), outputs=outputs)
+    # What it assumes is in the outcome.
+    bundle = promote(own, Path(to.strip()).expanduser(), outputs=outputs, on_progress=lambda text: None)
     samples = counted(len(bundle.samples), "sample")
     names = f"output{'s' * (len(bundle.settings.outputs) != 1)} {listed(bundle.settings.outputs)}"
     text = f"Promoted to {to.strip()}: {names}; {samples} replayed in a fresh process, identical."
-    return Outcome("done", text, to)
+    assumptions = bundle.settings.assumptions()
+    return Outcome("done", f"{text}\n{assumptions}" if assumptions else text, to)
 
 
 def start_write_back(job: ReportingJob, write: Callable[[bool], Any], *, dry_run: bool) -> bool:
