@@ -39,6 +39,8 @@ _NEAR_FRAMES: Final = 32
 # A container's duration is rounded, and its last frame may have none.
 _MISSING_S: Final = 0.5
 _BOX_HEADER: Final = 8
+# The first version of PyAV that reads metadata in any encoding.
+_ANY_METADATA: Final = 19
 
 
 class Video(Sequence["Pixels"]):
@@ -322,8 +324,12 @@ def _open(path: Path) -> tuple[Any, Any]:
     if not size:
         raise ImageFileError(name, f"{name!r} is empty. Copy or record the video again.")
     try:
+        # PyAV 19 reads any metadata, and has no option for what is no UTF-8.
+        lenient: dict[str, Any] = (
+            {"metadata_errors": "ignore"} if int(av.__version__.partition(".")[0]) < _ANY_METADATA else {}
+        )
         # An absolute path, since "rtsp:x.mp4" would be the address of a stream.
-        container = av.open(str(path.absolute()), metadata_errors="ignore")
+        container = av.open(str(path.absolute()), **lenient)
     except av.FFmpegError as error:
         raise ImageFileError(name, _unopened_text(path)) from error
     stream: Any = container.streams.best("video")

@@ -302,3 +302,19 @@ def test_an_acquisition_captures_a_video_on_its_thread(mp4):
         frames = list(acquisition.rings[0]._frames)
     assert [frame.number for frame in frames] == list(range(1, COUNT + 1))
     assert [number_in(frame.image) for frame in frames] == list(range(COUNT))
+
+
+def test_a_title_in_another_encoding_is_no_obstacle(tmp_path):
+    import av
+
+    file = tmp_path / "title.mkv"
+    with av.open(str(file), "w") as container:
+        container.metadata["title"] = "Gr?n"
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode())
+    assert b"Gr?n" in file.read_bytes()
+    file.write_bytes(file.read_bytes().replace(b"Gr?n", "Grün".encode("latin-1")))
+    assert len(ep.video(file)) == 3
