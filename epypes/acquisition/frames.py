@@ -11,6 +11,7 @@ from sys import getrefcount
 from typing import Any, Final
 
 from epypes.errors import FrameUnavailable
+from epypes.images import Order, swapped
 
 Array = Any
 
@@ -36,6 +37,11 @@ class Frame:
     captured_ns: int
     number: int
     time_s: float | None = None
+
+    def image_in(self, order: Order) -> Array:
+        """Return the image with its colours in an order; one channel has none."""
+        has_swap = order == "rgb" and self.image.ndim == 3 and self.image.shape[2] in (3, 4)
+        return swapped(self.image) if has_swap else self.image
 
     def __repr__(self) -> str:
         shape = getattr(self.image, "shape", "?")

@@ -121,7 +121,7 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     if isinstance(images, Video):
         images = [images]
     _check_set(images)
-    return _of_values(images, free)
+    return _of_values(images, runner)
 
 
 def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
@@ -404,15 +404,15 @@ def _check_set(images: Any) -> None:
         raise ScaleError(f"images can't be {type(images).__name__!r}. Give {_KINDS}.")
 
 
-def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
-    number, is_copied = 0, not holds_its_arrays(images)
+def _of_values(images: Iterable[Any], runner: CompGraphRunner) -> Iterator[Item]:
+    number, is_copied, free = 0, not holds_its_arrays(images), runner.free_source_tokens
     for value in images:
         if _video_in(value) is not None:
             for one in by_frame(value):
-                yield _item(number, one, free)
+                yield _item(number, one, free, runner.cg)
                 number += 1
             continue
-        item = _item(number, value, free)
+        item = _item(number, value, free, runner.cg)
         # The image of a frame is nobody else's.
         if is_copied and not item.series:
             item = replace(item, payload=defensive_copy(item.payload))
@@ -425,12 +425,13 @@ def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
         raise ScaleError(f"The image set is empty: the {type(images).__name__} gave nothing. Give {_KINDS}.")
 
 
-def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
+def _item(number: int, value: Any, free: tuple[str, ...], cg: CompGraph) -> Item:
     if isinstance(value, Item):
         return value
     if isinstance(value, Frame):
         token = _only(free, f"item #{number} is one frame")
-        return Item(number, f"#{value.number}", {token: value.image}, _CAMERA, value.number, value.time_s)
+        image = value.image_in(colour_order(cg, token))
+        return Item(number, f"#{value.number}", {token: image}, _CAMERA, value.number, value.time_s)
     if isinstance(value, Mapping):
         if set(value) != set(free):
             named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))

@@ -174,7 +174,7 @@ def map_images(
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the
         same, unless a function keeps something from one item to the next: a bundle refuses it, threads can't notice it.
         ``ep.delay`` keeps it in a token.
-        Functions of a module that is not installed, such as a file next to the notebook, can't go to other processes.
+        Modules of the project that the functions import go along.
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.
     show

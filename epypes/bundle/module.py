@@ -45,7 +45,8 @@ _NOT_MADE_AGAIN: Final = (
     "or tuples of them."
 )
 _NO_INITIAL: Final = (
-    "is of type {kind}, and no expression makes it again. Begin with None, and make it in the function when it gets "
+    "is of type {kind}, and no expression makes it again. State is numbers, text, arrays and containers of them: begin "
+    "with None, and make it in the function when it gets "
     "None: {}."
 )
 _ADAPTER_COMMENTS: Final = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}

@@ -24,6 +24,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.acquisition import Frame
+from epypes.acquisition.video import Video
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.arrays import store_hyperparameters
 from epypes.bundle.clone import clone_runner, parameters_of
@@ -36,7 +38,7 @@ from epypes.bundle.objects import describe_message
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import MOST_NUMBERS, Settings, states_of, unwritable, writable_defaults, write_settings
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
-from epypes.graph import ASSUMED, ColourOrder, CompGraph
+from epypes.graph import ASSUMED, ColourOrder, CompGraph, colour_order
 from epypes.images import has_colours
 from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
@@ -84,7 +86,8 @@ def promote(
         without. Otherwise it takes and gives Envelopes with one part per token. Events may be Envelopes or bytes.
     samples
         Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
-        or mappings by token. If the graph has delays, they are a sequence that goes on from the last run.
+        or mappings by token. A video, and frames of one or of a camera, get the token's order of colours. If the graph
+        has delays, they are a sequence that goes on from the last run.
     on_progress
         Called with what is being done, and with what was assumed or found that is worth knowing. Without, an order of
         colours that is assumed is logged as a warning.
@@ -211,8 +214,12 @@ def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:
     initial = dict(clone_runner(runner).state)
     has_first = not any(differences(initial, dict(run.state_before)))
     yield run
-    for number, sample in enumerate(samples, 1):
-        payload = sample if isinstance(sample, Mapping) else dict.fromkeys(runner.free_source_tokens[:1], sample)
+    for number, sample in enumerate(samples.frames() if isinstance(samples, Video) else samples, 1):
+        given = sample if isinstance(sample, Mapping) else dict.fromkeys(runner.free_source_tokens[:1], sample)
+        payload = {
+            token: value.image_in(colour_order(runner.cg, token)) if isinstance(value, Frame) else value
+            for token, value in given.items()
+        }
         run = _run_from(runner, payload, run.state, f"Sample {number} can't be run")
         has_first = has_first or not any(differences(initial, dict(run.state_before)))
         yield run

@@ -47,7 +47,8 @@ _NO_VALUE: Final = (
     "numbers, strings, a small array or tuples of them."
 )
 _NO_INITIAL: Final = (
-    "is of type {kind}, and no expression makes it again. Begin with None, and make it in the function when it gets "
+    "is of type {kind}, and no expression makes it again. State is numbers, text, arrays and containers of them: begin "
+    "with None, and make it in the function when it gets "
     "None."
 )
 _STATE_OF_NOTHING: Final = (

@@ -89,11 +89,11 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
             unwritten = f": {wanted[token]} is not written" if token in wanted else ""
             click.echo(f"{token} = Nothing{unwritten}")
         elif token not in files:
-            click.echo(f"{token} = {_text_of(value)}")
+            click.echo(f"{token} = {_text_of(value, settings.order(token))}")
     _print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
 
 
-def _text_of(value: Any, level: int = 3) -> str:
+def _text_of(value: Any, order: Order, level: int = 3) -> str:
     """Return an answer as text: vectors and small matrices as their numbers, also in lists and dicts."""
     import numpy as np
 
@@ -101,20 +101,21 @@ def _text_of(value: Any, level: int = 3) -> str:
 
     if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
         is_short = value.ndim == 1 or (0 < value.size <= _MOST_NUMBERS and 0 < value.ndim <= _MOST_AXES)
-        return _items_text(value, _MOST_AXES) if is_short else preview(value).text
+        return _items_text(value, order, _MOST_AXES) if is_short else preview(value, order).text
     if type(value) in (list, tuple) and level:
-        return _items_text(value, level - 1)
+        return _items_text(value, order, level - 1)
     if type(value) is dict and 0 < len(value) <= _MOST_NUMBERS and level:
-        return f"{{{', '.join(f'{preview(key).text}: {_text_of(item, level - 1)}' for key, item in value.items())}}}"
-    return str(value) if isinstance(value, np.generic | float) else preview(value).text
+        items = (f"{preview(key).text}: {_text_of(item, order, level - 1)}" for key, item in value.items())
+        return f"{{{', '.join(items)}}}"
+    return str(value) if isinstance(value, np.generic | float) else preview(value, order).text
 
 
-def _items_text(values: Any, level: int) -> str:
+def _items_text(values: Any, order: Order, level: int) -> str:
     """Return items in brackets, of many the first and the last ones."""
     count, half = len(values), _MOST_NUMBERS // 4
     if count <= _MOST_NUMBERS:
-        return f"[{', '.join(_text_of(item, level) for item in values)}]"
-    first, last = (", ".join(_text_of(item, level) for item in part) for part in (values[:half], values[-half:]))
+        return f"[{', '.join(_text_of(item, order, level) for item in values)}]"
+    first, last = (", ".join(_text_of(item, order, level) for item in part) for part in (values[:half], values[-half:]))
     return f"[{first}, ..., {last}] ({count} in all)"
 
 

@@ -266,3 +266,23 @@ def test_a_search_takes_the_frames_of_a_video(video, runner, as_path):
     )  # fmt: skip
     assert len(found) == 4
     assert not found.failures
+
+
+def redness(image):
+    return float(image[..., 0].mean())
+
+
+def test_frames_of_a_camera_have_the_order_of_their_token(tmp_path):
+    video = tmp_path / "red.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 25, (64, 48))
+    for _ in range(3):
+        writer.write(np.full((48, 64, 3), (0, 0, 250), np.uint8))
+    writer.release()
+    bgr = ep.CompGraph({"redness": redness}, {"redness": ("image", "first_channel")})
+    rgb = bgr | ep.CompGraph(
+        {"gray": lambda image: cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)}, {"gray": ("image", "image_gray")}
+    )
+    for cg, expected in ((bgr, 0), (rgb, 250)):
+        for images in (video, ep.video(video), ep.camera(video), [*ep.camera(video)]):
+            found = ep.map(ep.CompGraphRunner(cg), images, progress=False).to_frame()["first_channel"]
+            assert np.allclose(found, expected, atol=8)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, Final, overload
 
+from epypes.acquisition import Frame
 from epypes.acquisition.files import is_video_name
 from epypes.acquisition.video import Video
 from epypes.display import encode_image, is_image
@@ -154,7 +155,7 @@ def _values(runner: Tunable, free: tuple[str, ...], item: Any, where: str) -> di
         if len(free) > 1:
             text = f"{where} does not say which of {_named(free)} it is. Give mappings: {_call(free)}."
             raise PayloadError(free, text)
-        return {free[0]: item}
+        item = {free[0]: item}
     for token in item:
         if token not in runner.cg.tokens:
             raise UnknownName("token", token, free)
@@ -164,7 +165,11 @@ def _values(runner: Tunable, free: tuple[str, ...], item: Any, where: str) -> di
     missing = tuple(token for token in free if token not in item)
     if missing:
         raise PayloadError(missing, f"{where} has no value for {_named(missing)}. Give all: {_call(free)}.")
-    return {token: item[token] for token in free}
+    given = {token: item[token] for token in free}
+    return {
+        token: value.image_in(colour_order(runner.cg, token)) if isinstance(value, Frame) else value
+        for token, value in given.items()
+    }
 
 
 def _named(tokens: tuple[str, ...]) -> str:

@@ -174,9 +174,21 @@ def _bulge(start: Point, end: Point) -> float:
     return min(_LEAST_BULGE_PX + 0.1 * math.dist(start, end), _MOST_BULGE_PX)
 
 
+def _crossed(boxes: Sequence[Box], centres: Sequence[Point], edge: Edge, side: int) -> int:
+    """Return how many vertices stand beside the ends of an edge, where its arc would leave or come."""
+    reach = _bulge(*(centres[end] for end in edge))
+    return sum(
+        0 < side * (x - centres[end][0]) < (boxes[end].width + box.width) / 2 + reach
+        and abs(y - centres[end][1]) < box.height / 2
+        for end in edge
+        for (x, y), box in zip(centres, boxes, strict=True)
+    )
+
+
 def _arc(boxes: Sequence[Box], centres: Sequence[Point], edge: Edge) -> tuple[Point, ...]:
     tail, head = edge
-    side = -1 if centres[tail][0] <= centres[head][0] else 1
+    usual = -1 if centres[tail][0] <= centres[head][0] else 1
+    side = min((usual, -usual), key=lambda side: _crossed(boxes, centres, edge, side))
     (x0, y0), (x1, y1) = ((centres[end][0] + side * boxes[end].width / 2, centres[end][1]) for end in edge)
     out, end = side * _bulge(centres[tail], centres[head]), x1 + side * _TIP_PX
     return (x0, y0), (x0 + out, y0), (end + out, y1), (end, y1), (x1, y1)
