@@ -159,7 +159,7 @@ def test_the_note_shows_small_values_and_the_shape_of_arrays(edge_runner, photog
     [
         (np.zeros((2, 3)), "x: float64 2 x 3"),
         (np.array(3), "x: int64 without axes"),
-        (np.float32(2.5), "x=np.float32(2.5)"),
+        (np.float32(2.5), f"x={np.float32(2.5)!r}"),
         ([1, 2, 3], "x: list of 3 int"),
         ((np.zeros(3), np.zeros(3)), "x: tuple of 2 ndarray"),
         ([1, "a"], "x: list of 2"),
