@@ -429,7 +429,10 @@ class _Function:
         for previous in delays:
             token = self.cg.delays[previous].token
             maker = self.cg.digraph.producer.get(token, "")
-            yield self._state(self.variables[previous], self.defaults[previous], maker, self.variables[token])
+            variable, default, after = self.variables[previous], self.defaults[previous], self.variables[token]
+            yield self._state(
+                variable, default, maker, after, may_be_nothing=bool(maker) and token in self.may_be_nothing
+            )
         for name in keepers:
             self.left[name] = left = self._variable(f"{name}_state")
             for inner in self.module.pipelines[id(without_nodes(self.cg.functions[name]))].states:
@@ -437,8 +440,10 @@ class _Function:
                 after = f'{left}["{inner.parameter}"]'
                 yield self._state(parameter, inner.default, name, after, inner.parameter)
 
-    def _state(self, parameter: str, default: str, maker: str, after: str, inner: str = "") -> _State:
-        following = self._variable(f"next_{parameter}") if self.regions.get(maker) else ""
+    def _state(
+        self, parameter: str, default: str, maker: str, after: str, inner: str = "", may_be_nothing: bool = False
+    ) -> _State:
+        following = self._variable(f"next_{parameter}") if may_be_nothing or self.regions.get(maker) else ""
         return _State(parameter, default, maker, after, following, inner)
 
     def _call(self, name: str) -> str:

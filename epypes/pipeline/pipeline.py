@@ -128,9 +128,14 @@ class Pipeline(Node, TokenMapping):
 
     def __epypes_call_with_state__(self, state: Mapping[str, Any], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
         """Call the pipeline with a state that the caller keeps; return its value and the state after."""
-        with self.runner._series:
-            self.runner.state = state
-            return self(*inputs), self.runner.state
+        runner = self.runner
+        with runner._series:
+            own = runner._kept
+            runner.state = state
+            try:
+                return self(*inputs), runner.state
+            finally:
+                runner._kept = own
 
     @property
     def state(self) -> Mapping[str, Any]:

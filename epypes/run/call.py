@@ -11,7 +11,7 @@ from typing import Any
 from epypes.errors import ContractBroken, InputMutated, OutputArityError
 from epypes.images import Image
 from epypes.nothing import Nothing, NothingGiven
-from epypes.run.guard import ARRAYLESS, FRESH, is_array, keep, lend, writable, writable_copy
+from epypes.run.guard import ARRAYLESS, FRESH, is_array, keep, lend, lend_to_reader, writable, writable_copy
 from epypes.run.program import Program, Step
 from epypes.run.snapshot import Snapshot
 
@@ -66,12 +66,14 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
 def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
     """Return the inputs of a step that is not plain; a switch passes values on as they are stored."""
     args = [values[slot] for slot in step.inputs]
-    for arg in args if step.switch is None else (values[slot] for slot in program.read_by(step, values)):
-        if arg is Nothing:
-            raise NothingGiven
+    if any(values[slot] is Nothing for slot in program.required_by(step, values)):
+        raise NothingGiven
     if program.guard and step.switch is None:
-        pass_on = writable if step.unguarded else lend
-        args = [(writable_copy if at in step.in_out else pass_on)(arg) for at, arg in enumerate(args)]
+        pass_on, own = writable if step.unguarded else lend, len(program.slots)
+        args = [
+            lend_to_reader(arg) if slot >= own else (writable_copy if at in step.in_out else pass_on)(arg)
+            for at, (slot, arg) in enumerate(zip(step.inputs, args, strict=True))
+        ]
     if step.contracts is not None:
         _check(program, step, step.contracts[0], step.inputs, args)
     return args

@@ -369,7 +369,7 @@ class _Source:
             yield f"{''.join(f'{name}, ' for name in made) or '_'} = call(program, steps[{step.place}], v, d)"
             return
         args = [f"v[{slot}]" for slot in step.inputs]
-        if not program.guard and (asked := [slot for slot in step.inputs if slot not in self._plain]):
+        if not program.guard and (asked := self._may_be_nothing(step)):
             # Nothing else looks at the inputs.
             yield f"if {' or '.join(f'v[{slot}] is Nothing' for slot in asked)}: start = 0; raise NothingGiven"
         for place, slot in enumerate(step.inputs):
@@ -395,6 +395,9 @@ class _Source:
             yield f"else: {unknown and unknown + 'False; '}{names} = unpack(program, steps[{step.place}], made, v)"
         elif program.guard and step.outputs:
             yield from self._keep("m0", step.outputs[0])
+
+    def _may_be_nothing(self, step: Step) -> list[int]:
+        return [slot for slot in step.inputs if slot not in self._plain and slot < len(self._program.slots)]
 
     def _kind(self, slot: int) -> type:
         return self._kinds[slot] if self._kinds else object

@@ -225,6 +225,10 @@ class Program:
             return step.inputs  # the selector has no value, or one that is refused when the step runs
         return step.inputs[0], step.inputs[1 + branch]
 
+    def required_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
+        """Return the slots without whose values a step is skipped: what it reads, but for a nested pipeline's state."""
+        return tuple(slot for slot in self.read_by(step, values) if slot < len(self.slots))
+
     def running_functions(self) -> tuple[str, ...]:
         """Return the functions that were called and have not returned, in run order."""
         places = {getattr(each, "running", -1) for each in tuple(self.running)}
@@ -276,6 +280,7 @@ def _with_state_slots(steps: Iterable[Step], count: int, states: list[StateSlots
             inputs=(*step.inputs, *(state.before for state in own)),
             outputs=(*step.outputs, *(state.after for state in own)),
             single=False,
+            is_plain=False,
         )
 
 

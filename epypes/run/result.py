@@ -14,6 +14,7 @@ from epypes.rich_display import mimebundle
 from epypes.run.failure import Failure
 from epypes.run.guard import READ_AS_STORED, lend, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
+from epypes.run.plan import wanted_steps
 from epypes.run.program import Program, StateSlots
 from epypes.run.staleness import NOT_COMPUTED, TokenManager
 from epypes.run.timing import RunReport, Times
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 # hyperparameters with their versions, times, failure.
 Record = tuple[list[Any], bytes, bool, tuple[Any, ...], Hyperparameters, Times, Failure | None]
 
-# The state of a runner when a trial began: the runner's key, its hyperparameters, its last run. That one is not kept
-# alive, since a run's memory is that of its images.
-TrialOf = tuple[object, Hyperparameters, "ref[Run] | None"]
+# The state of a runner when a trial began: the runner's key, its hyperparameters, its last run, and what it had kept for
+# the next one. The last run is not kept alive, since a run's memory is that of its images.
+TrialOf = tuple[object, Hyperparameters, "ref[Run] | None", tuple[Any, ...]]
 
 
 class TokenMapping(Mapping[str, Any]):
@@ -106,19 +107,25 @@ class Run(TokenMapping):
         """What the run began with, by delayed token; ``runner.trial`` takes it to repeat the run on its payload."""
         values, program = self.record[0], self.record[4].program
         known = {slots.key: values[slots.before] for slots in program.states}
-        return MappingProxyType({key: lend(value) if program.guard else value for key, value in known.items()})
+        return MappingProxyType(
+            {key: lend_to_reader(value) if program.guard else value for key, value in known.items()}
+        )
 
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
-        values, *_, failure = self.record
+        values, *_, hparams, times, failure = self.record
+        program, wanted = hparams.program, times[1]
+        needed = wanted_steps(program, values, ()) if program.switches else None
 
         def value_after(slots: StateSlots) -> Any:
-            after = values[slots.after]
+            after, maker = values[slots.after], program.makers[slots.after]
+            # A rerun that chose another branch still has the value of the run before.
+            is_left_out = needed is not None and maker >= 0 and not needed[maker] and not (wanted and wanted[maker])
             # Of a rerun for other targets the value may be stale: it is still what the frame has left.
-            is_kept = failure or after is NOT_COMPUTED or after is Nothing
+            is_kept = failure or is_left_out or after is NOT_COMPUTED or after is Nothing
             return values[slots.before] if is_kept else after
 
-        return tuple(map(value_after, self.record[4].program.states))
+        return tuple(map(value_after, program.states))
 
     @property
     def cg(self) -> CompGraph:
@@ -224,7 +231,7 @@ class RunImporter:
         """Give the steps that were skipped, as far as the tokens say, whose outputs become Nothing."""
         program = self._program
         for step in program.steps:
-            seen = [slots[slot] is Nothing for slot in (*program.read_by(step, slots), *step.outputs)]
+            seen = [slots[slot] is Nothing for slot in (*program.required_by(step, slots), *step.outputs)]
             if step.place not in ran and any(seen):
                 program.has_skipped = True
                 for slot in step.outputs:

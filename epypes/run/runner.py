@@ -235,7 +235,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         if last is None:
             free = self.free_source_tokens
             raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first.")
-        trial_of = (self._key, first, ref(last)) if is_trial else None
+        trial_of = (self._key, first, ref(last), self._kept) if is_trial else None
         values, dirty, has_payload, _, before, _, failure = last.record
         # A failure keeps this frame, with all that is named in it: the run before, which may have failed too.
         del failure
@@ -326,7 +326,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         with self._lock:
             self.last = run
             if program.states:
-                self._kept = run.state_after()
+                self._kept = self._state_left_by(run)
         self._keep_times(times)
         if self._watchers:
             self._tell_watchers()
@@ -366,7 +366,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         with self._lock:
             self.last = run
             if self._program.states and failure is None:
-                self._kept = run.state_after()
+                self._kept = self._state_left_by(run)
         self.reports.add(times)
         if self._watchers:
             self._tell_watchers()
@@ -420,7 +420,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         start_ns = perf_counter_ns()
         before, last = self._state
         hparams = before.frozen(values, also_new=False)
-        trial_of = self._key, before, None if last is None else ref(last)
+        trial_of = self._key, before, None if last is None else ref(last), self._kept
         begin = None if state is None else self._state_of(state)
         return self._run_from_scratch(hparams, payload, targets, start_ns, trial_of, begin)
 
@@ -434,15 +434,16 @@ class CompGraphRunner(OldNames, TokenMapping):
         ValueError
             The run was not tried by this runner.
         """
-        key, before, last = getattr(run, "trial_of", (None, None, None))
+        key, before, last, kept = getattr(run, "trial_of", (None,) * 4)
         if key is not self._key:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
-        with self._lock:
-            if before is not self._hparams or (None if last is None else last()) is not self.last:
+        with self._series if self._program.states else _NO_SERIES, self._lock:
+            is_as_it_was = before is self._hparams and (None if last is None else last()) is self.last
+            if not is_as_it_was or kept is not self._kept:
                 return False
             self._hparams, self.last = run.record[4], run
             if self._program.states and run.failure is None:
-                self._kept = run.state_after()
+                self._kept = self._state_left_by(run)
         self.reports.add(run.record[5])
         self._tell_watchers()
         return True
@@ -564,6 +565,15 @@ class CompGraphRunner(OldNames, TokenMapping):
         with self._series, self._lock:
             self._kept = self._initial_state()
         self._tell_watchers()
+
+    def _state_left_by(self, run: Run) -> tuple[Any, ...]:
+        """Return what the next run begins with; arrays that others may fill again, as a payload's, are copied."""
+        program, values = self._program, run.state_after()
+        if not program.guard:
+            return values
+        return tuple(
+            keep(value, 0, program, slots.before, ()) for slots, value in zip(program.states, values, strict=True)
+        )
 
     def _initial_state(self) -> tuple[Any, ...]:
         return tuple(slots.initial for slots in self._program.states)

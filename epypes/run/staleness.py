@@ -198,7 +198,7 @@ class TokenManager(OldNames):
         program, values = self.program, self.values
         found: dict[str, tuple[str, ...]] = {}
         for step in program.steps:
-            slots = [slot for slot in dict.fromkeys(program.read_by(step, values)) if values[slot] is Nothing]
+            slots = [slot for slot in dict.fromkeys(program.required_by(step, values)) if values[slot] is Nothing]
             if slots:
                 found[step.name] = tuple(program.tokens[slot] for slot in slots)
         return found
@@ -256,7 +256,7 @@ def skipped_steps(program: Program, values: Sequence[Any], dirty: Sequence[int])
     return tuple(
         step.place
         for step in program.steps
-        if not dirty[step.place] and any(values[slot] is Nothing for slot in program.read_by(step, values))
+        if not dirty[step.place] and any(values[slot] is Nothing for slot in program.required_by(step, values))
     )
 
 

@@ -595,5 +595,16 @@ def test_state_of_what_some_branches_need_is_refused_and_so_is_an_initial_value_
     with pytest.raises(SourceRefused, match="Function 'mix' makes what the next run begins with, and only some"):
         ep.to_source(cg, {"k": 0.5})
     cg = ep.CompGraph({"step": names["step"]}, {"step": (("x", "before"), "y")})
-    with pytest.raises(SourceRefused, match="The initial value of 'before' is of type object.*Begin with None"):
+    with pytest.raises(SourceRefused, match="The initial value of 'before' is of type object.*begin with None"):
         ep.to_source(ep.delay(cg, "y", "before", object()))
+
+
+def test_state_stays_as_it_was_where_nothing_was_found():
+    names = notebook("def find(x):\n    return x if x > 0 else ep.Nothing\n\n\ndef add(m, t):\n    return m + t\n")
+    functions = {name: names[name] for name in ("find", "add")}
+    cg = ep.delay(ep.CompGraph(functions, {"find": ("x", "m"), "add": (("m", "t"), "s")}), "s", "t", 0)
+    run_graph, runner, state = executed(ep.to_source(cg)), ep.CompGraphRunner(cg), {}
+    for x in (1, 2, -1, 3, -2, 4):
+        found, state = run_graph(x, **state)
+        assert found == runner.run(x=x)["s"]
+        assert state == dict(runner.state)

@@ -360,3 +360,83 @@ def test_any_series_of_runs_equals_a_loop_over_one_variable(actions):
             before, x = left, number
             left = smooth(x, before, k)
         assert dict(runner.state) == {"before": left}
+
+
+# -- where delays meet other features ---------------------------------------------------------------------------------
+
+
+def test_a_delayed_payload_is_what_it_was_although_its_buffer_is_filled_again():
+    cg = ep.CompGraph(
+        {"step": lambda x, last: 0 if last is None else int(x.max()) - int(last.max()), "crop": lambda x: x[:2]},
+        {"step": (("x", "last"), "d"), "crop": ("x", "part")},
+    )
+    for token in ("x", "part"):
+        runner, buffer, found = ep.CompGraphRunner(ep.delay(cg, token, "last")), np.zeros(4, np.uint8), []
+        for value in (1, 2, 4, 8, 16, 32):
+            buffer[:] = value
+            found.append(runner.run(x=buffer)["d"])
+        assert found == [0, 1, 2, 4, 8, 16]
+
+
+def test_a_run_that_began_with_nothing_says_so():
+    cg = ep.CompGraph(
+        {"step": lambda x, last: x - last, "ten": lambda x: 10 * x}, {"step": (("x", "last"), "d"), "ten": ("x", "t")}
+    )
+    runner = ep.CompGraphRunner(ep.delay(cg, "x", "last", ep.Nothing))
+    assert dict(runner.run(x=1).state_before) == {"last": ep.Nothing}
+    assert (runner.last["d"], runner.last["t"], runner.run(x=4)["d"]) == (ep.Nothing, 10, 3)
+
+
+@pytest.mark.parametrize("guard", [True, False])
+def test_a_nested_pipeline_whose_state_is_nothing_runs_all_the_same(guard):
+    cg = ep.CompGraph(
+        {"step": lambda x, last: x - last, "ten": lambda x: 10 * x}, {"step": (("x", "last"), "d"), "ten": ("x", "t")}
+    )
+    inner = ep.Pipeline("inner", ep.delay(cg, "x", "last", ep.Nothing))
+    runner = ep.CompGraphRunner(ep.CompGraph({"inner": inner}, {"inner": ("x", ("d", "t"))}), guard=guard)
+    found = [(run["d"], run["t"]) for run in (runner.run(x=x) for x in (1, 4, 9, 16, 25, 36))]
+    assert found == [(ep.Nothing, 10), (3, 40), (5, 90), (7, 160), (9, 250), (11, 360)]
+
+
+def test_a_rerun_that_chooses_another_branch_leaves_what_a_run_from_scratch_leaves():
+    cg = ep.CompGraph(
+        {"add": lambda x, b: x + b, "negate": lambda x: -x}, {"add": (("x", "b"), "total"), "negate": ("x", "negative")}
+    ) | ep.switch("choose", {"on": "total", "off": "negative"}, by="mode", output="out")
+    runner = ep.CompGraphRunner(ep.delay(cg, "total", "b", 0), {"mode": "on"})
+    runner.run(x=1)
+    runner.rerun(mode="off")
+    assert dict(runner.state) == {"b": 0}
+    runner.rerun(mode="on")
+    assert dict(runner.state) == {"b": 1}
+
+
+def test_a_trial_is_not_adopted_after_a_reset(runner):
+    runner.run(x=4)
+    tried = runner.trial({"k": 1.0})
+    runner.reset()
+    assert not runner.adopt(tried)
+    assert dict(runner.state) == {"before": None}
+
+
+def test_runs_and_adopted_trials_of_two_threads_lose_nothing():
+    cg = ep.CompGraph({"add": lambda x, t: x + t}, {"add": (("x", "before"), "total")})
+    runner, adopted, is_over = ep.CompGraphRunner(ep.delay(cg, "total", "before", 0)), [], threading.Event()
+
+    def adopt():
+        while not is_over.is_set():
+            adopted.append(runner.adopt(runner.trial({}, payload={"x": 1})))
+
+    thread = threading.Thread(target=adopt)
+    thread.start()
+    for _ in range(500):
+        runner.run(x=1)
+    is_over.set()
+    thread.join(60)
+    assert dict(runner.state) == {"before": 500 + sum(adopted)}
+
+
+def test_a_pipelines_own_series_goes_on_beside_that_of_an_outer_graph():
+    cg = ep.CompGraph({"add": lambda x, t: x + t}, {"add": (("x", "before"), "total")})
+    inner = ep.Pipeline("inner", ep.delay(cg, "total", "before", 0))
+    outer = ep.CompGraphRunner(ep.CompGraph({"inner": inner}, {"inner": ("x", "y")}))
+    assert (inner(1), outer.run(x=100)["y"], inner(1), outer.run(x=100)["y"]) == (1, 100, 2, 200)
