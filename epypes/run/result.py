@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 # hyperparameters with their versions, times, failure.
 Record = tuple[list[Any], bytes, bool, tuple[Any, ...], Hyperparameters, Times, Failure | None]
 
-# The state of a runner when a trial began: the runner's key, its hyperparameters, its last run, and what it had kept for
-# the next one. The last run is not kept alive, since a run's memory is that of its images.
+# The state of a runner when a trial began: the runner's key, its hyperparameters, its last run, and what the next run
+# would have begun with. The last run is not kept alive, since a run's memory is that of its images.
 TrialOf = tuple[object, Hyperparameters, "ref[Run] | None", tuple[Any, ...]]
 
 
