@@ -284,8 +284,8 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
         if key not in _LOADED:
             if packaged.package.files is None:
                 return None
-            folder = tempfile.TemporaryDirectory(prefix="epypes-package-")
             try:
+                folder = tempfile.TemporaryDirectory(prefix="epypes-package-")
                 bundle = _unpacked(packaged.package.files, Path(folder.name))
                 values = unpacked_values(packaged.hyperparameters, bundle.enums)
                 _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options)), folder
