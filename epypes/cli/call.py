@@ -90,7 +90,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
             click.echo(f"{token} = Nothing{unwritten}")
         elif token not in files:
             click.echo(f"{token} = {_text_of(value, settings.order(token))}")
-    _print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
+    _print_answer(": ".join([str(bundle), *filter(None, [" ".join(files.values())])]), answer)
 
 
 def _text_of(value: Any, order: Order, level: int = 3) -> str:

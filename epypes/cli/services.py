@@ -128,7 +128,12 @@ def describe_failures(address: str, is_shown: bool) -> str:
 @click.option("--pub", default=_ANY_PORT, help="Address of answers: one to bind, connect:ADDRESS, or a broker's queue.")
 @click.option("--failures", default=_ANY_PORT, help="Extra address that receives only failures, as --pub.")
 @click.option("--http", default="", help="Address of the HTTP control, as 127.0.0.1:8642.", show_default="none")
-@click.option("--threads", type=click.IntRange(1, 64), default=1, help="Number of events computed at once, in order.")
+@click.option(
+    "--threads",
+    type=click.IntRange(1, 64),
+    default=1,
+    help="Number of events computed at once; answers in order, with --state-per source those of one source.",
+)
 @seconds_option("--job-timeout", 30.0, "Longest time for one event, until the worker is replaced", least=0.01)
 @seconds_option("--drain-timeout", 5.0, "Longest wait for accepted events after SIGTERM")
 @click.option("--retries", type=click.IntRange(0), default=1, help="Retries of an event that kills the worker.")
