@@ -252,13 +252,6 @@ def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
         return [f"The last run failed in {runner.last.failure}. Call {call} again first."]
     if runner.stale:
         return [f"These functions are stale: {', '.join(runner.stale)}. Call rerun() first."]
-    cg, last, left_out = runner.cg, runner.last, runner.plan().left_out if runner.state else ()
-    makers = {previous: cg.digraph.producer.get(delay.token) for previous, delay in cg.delays.items()}
-    for key in last.state:
-        maker = makers[key] if key in makers else next(name for name in cg.functions if key.startswith(f"{name}."))
-        if maker in left_out and any(differences(last.state_before[key], last.state[key])):
-            text = f"The last run left for {key!r} what function {maker!r} made before a rerun that leaves it out"
-            return [f"{text}; no run by itself does so. Call {call} again first."]
     return []
 
 

@@ -357,16 +357,14 @@ def test_a_switch_a_source_token_and_a_delay_of_a_delay_leave_what_they_left_in_
     assert bundle.settings.states == {"before": "smoothed", "one_before": "x", "two_before": "one_before"}
 
 
-def test_a_rerun_that_chose_another_branch_is_no_sample_since_no_run_leaves_its_state(names, tmp_path):
+def test_a_rerun_that_chose_another_branch_is_a_sample_that_leaves_the_state_as_it_was(names, tmp_path):
     cg = smoothing(names) | ep.CompGraph({"negated": names["negated"]}, {"negated": ("x", "negative")})
     cg |= ep.switch("choose", {"on": "y", "off": "negative"}, by="mode", output="chosen")
     runner = ep.CompGraphRunner(cg, {"k": 0.5, "by": 1, "mode": "on"})
     runner.run(x=4.0)
     runner.rerun(mode="off")
-    with pytest.raises(PromotionRefused, match=r"left for 'before' what function 'smooth' made .*runner\.run|run\(x="):
-        ep.promote(runner, tmp_path / "switch")
-    runner.run(x=2.0)
-    ep.promote(runner, tmp_path / "switch")
+    loaded = ep.load(ep.promote(runner, tmp_path / "switch").path)
+    assert (loaded.run(x=4.0)["chosen"], dict(loaded.state)) == (-4.0, {"before": None})
 
 
 def test_an_initial_value_that_no_run_takes_or_no_expression_makes_is_refused_with_the_way_out(names, tmp_path):
