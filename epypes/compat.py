@@ -322,7 +322,7 @@ MODULES: Final[Mapping[str, Mapping[str, Old]]] = {
         "ZeroMQPublisher": _function("ep.ZMQPublisher(address, queue)", _publisher),
     },
     "epypes.queue": {
-        "Queue": _moved("queue.Queue", "queue.Queue, or ep.Mailbox, which drops what comes too fast"),
+        "Queue": _moved("queue.Queue", "queue.Queue, or ep.Mailbox, which drops events that arrive too fast"),
         "create_queue_putter": _function("ep.FullPipeline, which puts what f_out returns on q_out", _queue_putter),
     },
     "epypes.reactivevision": {

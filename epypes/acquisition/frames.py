@@ -6,11 +6,13 @@ import math
 import operator
 import threading
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from sys import getrefcount
 from typing import Any, Final
 
 from epypes.errors import FrameUnavailable
+from epypes.graph import CompGraph, colour_order
 from epypes.images import Order, swapped
 
 Array = Any
@@ -38,14 +40,22 @@ class Frame:
     number: int
     time_s: float | None = None
 
-    def image_in(self, order: Order) -> Array:
-        """Return the image with its colours in an order; one channel has none."""
-        has_swap = order == "rgb" and self.image.ndim == 3 and self.image.shape[2] in (3, 4)
-        return swapped(self.image) if has_swap else self.image
-
     def __repr__(self) -> str:
         shape = getattr(self.image, "shape", "?")
         return f"<Frame {self.number}: {shape} {getattr(self.image, 'dtype', '')}>"
+
+
+def with_images(payload: Mapping[str, Any], cg: CompGraph) -> dict[str, Any]:
+    """Return a payload with images in place of frames, their colours in the orders of the graph's tokens."""
+    return {
+        token: _image(value, colour_order(cg, token)) if isinstance(value, Frame) else value
+        for token, value in payload.items()
+    }
+
+
+def _image(frame: Frame, order: Order) -> Array:
+    has_colours = frame.image.ndim == 3 and frame.image.shape[2] in (3, 4)
+    return swapped(frame.image) if has_colours and order == "rgb" else frame.image
 
 
 class Ring:

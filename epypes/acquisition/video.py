@@ -79,9 +79,8 @@ class Video(Sequence["Pixels"]):
 
     Examples
     --------
-    >>> video = Video("belt.avi")  # doctest: +SKIP
-    >>> len(video), video.times_s[:3], video[-1].shape  # doctest: +SKIP
-    (300, (0.0, 0.04, 0.08), (480, 640, 3))
+    ``video = Video("belt.avi")`` of 300 frames at 25 per second: ``len(video)`` is 300, ``video.times_s[:3]`` is
+    (0.0, 0.04, 0.08), and ``video[-1]`` is the last image.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 from typing import Any, Final
 
 from epypes.acquisition.files import IMAGE_ENDINGS, image_files, is_video_name, natural_order, read_image
-from epypes.acquisition.frames import Frame
+from epypes.acquisition.frames import Frame, with_images
 from epypes.acquisition.video import Video, VideoFrame
 from epypes.bundle.clone import clone_runner
 from epypes.errors import ScaleError
@@ -430,8 +430,8 @@ def _item(number: int, value: Any, free: tuple[str, ...], cg: CompGraph) -> Item
         return value
     if isinstance(value, Frame):
         token = _only(free, f"item #{number} is one frame")
-        image = value.image_in(colour_order(cg, token))
-        return Item(number, f"#{value.number}", {token: image}, _CAMERA, value.number, value.time_s)
+        payload = with_images({token: value}, cg)
+        return Item(number, f"#{value.number}", payload, _CAMERA, value.number, value.time_s)
     if isinstance(value, Mapping):
         if set(value) != set(free):
             named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))

@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.acquisition import Frame
+from epypes.acquisition.frames import with_images
 from epypes.acquisition.video import Video
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.arrays import store_hyperparameters
@@ -38,7 +38,7 @@ from epypes.bundle.objects import describe_message
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import MOST_NUMBERS, Settings, states_of, unwritable, writable_defaults, write_settings
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
-from epypes.graph import ASSUMED, ColourOrder, CompGraph, colour_order
+from epypes.graph import ASSUMED, ColourOrder, CompGraph
 from epypes.images import has_colours
 from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
@@ -216,11 +216,7 @@ def _runs(runner: CompGraphRunner, samples: Iterable[Any]) -> Iterator[Run]:
     yield run
     for number, sample in enumerate(samples.frames() if isinstance(samples, Video) else samples, 1):
         given = sample if isinstance(sample, Mapping) else dict.fromkeys(runner.free_source_tokens[:1], sample)
-        payload = {
-            token: value.image_in(colour_order(runner.cg, token)) if isinstance(value, Frame) else value
-            for token, value in given.items()
-        }
-        run = _run_from(runner, payload, run.state, f"Sample {number} can't be run")
+        run = _run_from(runner, with_images(given, runner.cg), run.state, f"Sample {number} can't be run")
         has_first = has_first or not any(differences(initial, dict(run.state_before)))
         yield run
     if not has_first:

@@ -178,7 +178,7 @@ class _FunctionBody(ColourCalls):
         # Nothing is written into the arrays of inputs, which are read-only.
         self._untouched = set(positional) - _stored(node)
         self._returned: list[tuple[Seen, tuple[Seen, ...]]] = []
-        # Whether what comes next is done in every call.
+        # Whether every call executes the statement that is looked at.
         self._is_sure = True
         if isinstance(node, ast.Lambda):
             self._returned.append(self._seen_with_parts(node.body))

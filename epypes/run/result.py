@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -97,19 +97,13 @@ class Run(TokenMapping):
 
         Of a failed run, and where nothing was found, it is what the run began with.
         """
-        states, guard = self.record[4].program.states, self.record[4].program.guard
-        values = zip(states, self.state_after(), strict=True)
-        known = {slots.key: value for slots, value in values if value is not NOT_COMPUTED}
-        return MappingProxyType({key: lend_to_reader(value) if guard else value for key, value in known.items()})
+        return readable_state(self.record[4].program, self.state_after())
 
     @property
     def state_before(self) -> Mapping[str, Any]:
         """What the run began with, by delayed token; ``runner.trial`` takes it to repeat the run on its payload."""
         values, program = self.record[0], self.record[4].program
-        known = {slots.key: values[slots.before] for slots in program.states}
-        return MappingProxyType(
-            {key: lend_to_reader(value) if program.guard else value for key, value in known.items()}
-        )
+        return readable_state(program, [values[slots.before] for slots in program.states])
 
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
@@ -170,6 +164,12 @@ class Run(TokenMapping):
         redefinitions = len(redefined(self.cg))
         old = f"; {counted(redefinitions, 'function')} redefined" * bool(redefinitions)
         return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
+
+
+def readable_state(program: Program, values: Sequence[Any]) -> Mapping[str, Any]:
+    """Return values in the order of the program's states as the user reads them, by key; those that are there."""
+    known = {slots.key: value for slots, value in zip(program.states, values, strict=True) if value is not NOT_COMPUTED}
+    return MappingProxyType({key: lend_to_reader(value) if program.guard else value for key, value in known.items()})
 
 
 class RunImporter:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import copy
 from time import perf_counter_ns
-from types import MappingProxyType
 from typing import Any, Final
 from weakref import ref
 
@@ -22,7 +21,7 @@ from epypes.run.guard import COPIERS, keep, lend_to_reader, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
-from epypes.run.result import Run, TokenMapping, TrialOf, new_run
+from epypes.run.result import Run, TokenMapping, TrialOf, new_run, readable_state
 from epypes.run.staleness import TokenManager, skipped_steps
 from epypes.run.timing import Reports
 from epypes.wording import counted
@@ -545,13 +544,7 @@ class CompGraphRunner(OldNames, TokenMapping):
 
         Of a nested pipeline the keys are ``"function.token"``. Set it, or some of its keys, to go on from there.
         """
-        states, kept = self._program.states, self._kept
-        return MappingProxyType(
-            {
-                slots.key: lend_to_reader(value) if self.guard else value
-                for slots, value in zip(states, kept, strict=True)
-            }
-        )
+        return readable_state(self._program, self._kept)
 
     @state.setter
     def state(self, values: Mapping[str, Any]) -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, Final, overload
 
-from epypes.acquisition import Frame
 from epypes.acquisition.files import is_video_name
+from epypes.acquisition.frames import with_images
 from epypes.acquisition.video import Video
 from epypes.display import encode_image, is_image
 from epypes.errors import PayloadError, UnknownName
@@ -165,11 +165,7 @@ def _values(runner: Tunable, free: tuple[str, ...], item: Any, where: str) -> di
     missing = tuple(token for token in free if token not in item)
     if missing:
         raise PayloadError(missing, f"{where} has no value for {_named(missing)}. Give all: {_call(free)}.")
-    given = {token: item[token] for token in free}
-    return {
-        token: value.image_in(colour_order(runner.cg, token)) if isinstance(value, Frame) else value
-        for token, value in given.items()
-    }
+    return with_images({token: item[token] for token in free}, runner.cg)
 
 
 def _named(tokens: tuple[str, ...]) -> str:
