@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import logging
+import math
 import queue
 import threading
 import weakref
@@ -24,6 +25,8 @@ from epypes.pipeline.pipeline import Pipeline
 POLL_S: Final = 0.05
 # Of a queue that has been empty for a while: to wake up takes up to 100 us of a core.
 LONGEST_POLL_S: Final = 0.25
+# How long a wait without an end blocks before signals are looked at.
+SIGNAL_POLL_S: Final = 0.25
 
 _log: Final = logging.getLogger("epypes.pipeline")
 
@@ -232,11 +235,17 @@ class EventLoop(OldNames):
         timeout_s
             How long to wait, in seconds; without it, for as long as it takes. Ctrl-C raises KeyboardInterrupt.
         """
+        deadline_s = math.inf if timeout_s is None else monotonic() + timeout_s
         with self._lock:
             thread, ended = self._thread, self._ended
-        # Not Thread.join: before Python 3.13, one that Ctrl-C interrupts takes the thread for ended.
-        if thread is not None and thread is not threading.current_thread() and ended.wait(timeout_s):
-            thread.join()
+        if thread is None or thread is threading.current_thread():
+            return not self.is_running
+        # Not Thread.join: before Python 3.13, one that Ctrl-C interrupts takes the thread for ended. And not without a
+        # time-out: a signal that comes just before a lock is waited for is seen only when that wait ends.
+        while not ended.wait(max(0.0, min(deadline_s - monotonic(), SIGNAL_POLL_S))):
+            if monotonic() >= deadline_s:
+                return False
+        thread.join()
         return not self.is_running
 
     def _loop(self, stop: threading.Event, ended: threading.Event) -> None:

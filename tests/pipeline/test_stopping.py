@@ -355,9 +355,12 @@ def test_a_script_that_waits_answers_events_until_ctrl_c_and_ends_in_order():
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as run:
-        assert run.stdout.readline() == "event 1\n"
-        run.send_signal(signal.SIGINT)
-        out, err = run.communicate(timeout=TIMEOUT_S)
+        try:
+            assert run.stdout.readline() == "event 1\n"
+            run.send_signal(signal.SIGINT)
+            out, err = run.communicate(timeout=TIMEOUT_S)
+        finally:
+            run.kill()
     assert (run.returncode, out, err) == (0, "camera closed\nTrue False\n", "")
 
 
