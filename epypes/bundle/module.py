@@ -44,11 +44,6 @@ _NOT_MADE_AGAIN: Final = (
     "is made with a {kind} that no expression makes again. Make it in __init__, from numbers, strings, a small array "
     "or tuples of them."
 )
-_NO_INITIAL: Final = (
-    "is of type {kind}, and no expression makes it again. State is numbers, text, arrays and containers of them: begin "
-    "with None, and make it in the function when it gets "
-    "None: {}."
-)
 _ADAPTER_COMMENTS: Final = {"f_in": "# How an event becomes a payload.", "f_out": "# How a run becomes an answer."}
 # The folder is wherever the bundle is: it may be moved.
 _TEXT: Final = '''"""{title}
@@ -195,6 +190,15 @@ def _io(variable: str, cg: CompGraph) -> str:
     return _dict(variable, {name: bracketed(tuple(sides), side) for name, sides in cg.func_io.items()})
 
 
+def no_initial_value(cg: CompGraph, previous: str) -> str:
+    """Return why a delay can't begin with a value that has no expression, for ``expression_or_none``."""
+    way_out = f"ep.delay(cg, {quoted(cg.delays[previous].token)}, {quoted(previous)}, initial=None)"
+    return (
+        "is of type {kind}, and no expression makes it again. State is numbers, text, arrays and containers of them: "
+        f"begin with None, and make it in the function when it gets None: {way_out}."
+    )
+
+
 class Graphs:
     """Writes a graph; its nodes, switches and the graphs of its pipelines become definitions of the module.
 
@@ -293,8 +297,7 @@ class Graphs:
         """Return the expression of a graph with one delay more; ``wanted`` names the array that it may begin with."""
         token, initial = cg.delays[previous]
         what = f"The initial value of {previous!r}{where}"
-        way_out = f"ep.delay(cg, {quoted(token)}, {quoted(previous)}, initial=None)"
-        value = expression_or_none(self.gathered, initial, what, _NO_INITIAL.format(way_out, kind="{kind}"), wanted)
+        value = expression_or_none(self.gathered, initial, what, no_initial_value(cg, previous), wanted)
         epypes = self.gathered.module_name("epypes", what)
         return f"{epypes}.delay({source}, {quoted(token)}, {quoted(previous)}, initial={value})"
 

@@ -148,7 +148,7 @@ class OwnModules:
         """
         if not self._modules:
             return
-        functions = sorted(_reached(values), key=lambda function: function.__code__.co_filename)
+        functions = sorted(functions_reached_by(values), key=lambda function: function.__code__.co_filename)
         # A package may import what a function needs only when it is asked for, by a name that no text has.
         homes = {str(function.__globals__.get("__name__")): function.__globals__ for function in functions}
         loaded = {name: loaded_module(name) for name in homes if name != "__main__"}
@@ -213,7 +213,7 @@ def _definition(function: types.FunctionType, module: OwnModule) -> Definition:
     return Definition(what, node, code.co_filename, lines, namespace_of(function), function, captured_by(function), ())
 
 
-def _reached(values: Iterable[Any]) -> Iterator[types.FunctionType]:
+def functions_reached_by(values: Iterable[Any]) -> Iterator[types.FunctionType]:
     """Give the user's functions that values refer to, each once."""
     waiting, seen = [*values], dict[int, Any]()
     while waiting:

@@ -129,6 +129,11 @@ def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str,
     return found
 
 
+def reads_of(function: types.FunctionType) -> dict[str, Any]:
+    """Return what the names that a function reads mean to it, in order of the names."""
+    return meanings_of(function, sorted({*function.__code__.co_freevars, *global_names(function.__code__)}))
+
+
 def defaults_of(function: types.FunctionType) -> dict[str, Any]:
     """Return the defaults of a function by parameter, as they are by now."""
     given, code = function.__defaults__ or (), function.__code__

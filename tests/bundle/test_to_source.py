@@ -608,3 +608,41 @@ def test_state_stays_as_it_was_where_nothing_was_found():
         found, state = run_graph(x, **state)
         assert found == runner.run(x=x)["s"]
         assert state == dict(runner.state)
+
+
+@pytest.mark.parametrize("where", ["always", "in a branch"])
+def test_a_pipeline_with_state_may_take_and_make_nothing(where):
+    names = notebook(
+        "def find(x):\n    return ep.Nothing if x < 0 else x\n\n\ndef add(m, before):\n    return m + before\n\n\n"
+        "def odd(s):\n    return s if s % 2 else ep.Nothing\n"
+    )
+    inner = ep.CompGraph({"add": names["add"], "odd": names["odd"]}, {"add": (("m", "before"), "s"), "odd": ("s", "o")})
+    pipeline = ep.Pipeline("total", ep.delay(inner, "s", "before", 0))
+    cg = ep.CompGraph({"find": names["find"], "total": pipeline}, {"find": ("x", "m"), "total": ("m", "y")})
+    cg |= ep.CompGraph({"both": names["add"]}, {"both": (("m", "y before"), "b")})
+    cg = ep.delay(cg, "y", "y before", 7)
+    values = {}
+    if where == "in a branch":
+        cg |= ep.switch("choose", {1: "y", 2: "b"}, by="how", output="z")
+        values = {"how": 1}
+    run_graph, runner, state = executed(ep.to_source(cg, values)), ep.CompGraphRunner(cg, values), {}
+    for number, x in enumerate((1, 2, -1, 3, 5, -2, 4, 8)):
+        how = {"how": 1 + (number == 4)} if values else {}
+        runner.set(**how)
+        run = runner.run(x=x)
+        found, state = run_graph(x, **how, **state)
+        assert (found if len(cg.sink_tokens) > 1 else (found,)) == tuple(run[token] for token in cg.sink_tokens)
+        assert [*state.values()] == [*run.state.values()]
+
+
+def test_state_stays_as_it_was_where_what_it_takes_is_nothing_by_now():
+    names = notebook("def add(x, before):\n    return x + before\n")
+    cg = ep.CompGraph(
+        {"add": names["add"], "more": names["add"]}, {"add": (("x", "second"), "y"), "more": (("x", "first"), "z")}
+    )
+    cg = ep.delay(ep.delay(cg, "first", "second", 3), "x", "first", ep.Nothing)
+    run_graph, runner, state = executed(ep.to_source(cg)), ep.CompGraphRunner(cg), {}
+    for x in (1, 2, 4):
+        run = runner.run(x=x)
+        found, state = run_graph(x, **state)
+        assert (*found, *state.values()) == (run["y"], run["z"], *run.state.values())
