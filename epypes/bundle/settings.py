@@ -14,8 +14,9 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from epypes.bundle.arrays import StoredArray
 from epypes.bundle.compare import Tolerance, read_tolerances
@@ -165,53 +166,58 @@ def states_of(cg: CompGraph) -> dict[str, str]:
 
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     """Write pipeline.toml, with a comment per section and the ranges that annotations and usual names give."""
-    with optional_import():
-        import tomlkit
+    toml = _toml()
     bundle: dict[str, Any] = {"format": FORMAT, "name": settings.name}
     bundle |= {} if settings.types else {"types": False}
     bundle |= {"groups": True} if settings.has_groups else {}
     ports = {"inputs": list(settings.inputs), "outputs": list(settings.outputs)}
     ports |= {"own": list(settings.own)} if settings.own else {}
-    document = tomlkit.document()
-    document.add(tomlkit.comment(_COMMENT))
-    document.add("bundle", _table(bundle))
-    document.add("ports", _table(ports))
-    colours = tomlkit.table(is_super_table=True)
-    for token, found in settings.colours.items():
-        colours.add(token, _colour_table(found))
-    if colours:
-        document.add("colours", colours)
-    if settings.states:
-        document.add("states", _table(settings.states, _STATES))
-    for section in ("hyperparameters", "defaults", "attributes"):
-        tables = tomlkit.table(is_super_table=True)
-        for name, value in getattr(settings, section).items():
-            if section == "hyperparameters":
-                takers = ", ".join(cg.digraph.consumers.get(name, ()))
-                tables.add(name, _table(_entry_of(cg, name, value), f"Taken by {takers}."))
-            else:
-                tables.add(name, _table(encode_value(value)))
-        if tables:
-            document.add(section, tables)
-    path.write_text(tomlkit.dumps(document), encoding="utf-8")
+    hyperparameters = {
+        token: _table(_entry_of(cg, token, value), f"Taken by {', '.join(cg.digraph.consumers.get(token, ()))}.")
+        for token, value in settings.hyperparameters.items()
+    }
+    sections: dict[str, Any] = {
+        "bundle": _table(bundle),
+        "ports": _table(ports),
+        "colours": {token: _colour_table(found) for token, found in settings.colours.items()},
+        "states": _table(settings.states, _STATES) if settings.states else {},
+        "hyperparameters": hyperparameters,
+        "defaults": {name: _table(encode_value(value)) for name, value in settings.defaults.items()},
+        "attributes": {name: _table(encode_value(value)) for name, value in settings.attributes.items()},
+    }
+    document = toml.document()
+    document.add(toml.comment(_COMMENT))
+    for name, section in sections.items():
+        if type(section) is dict and section:
+            tables = toml.table(is_super_table=True)
+            for key, table in section.items():
+                tables.add(key, table)
+            document.add(name, tables)
+        elif section:
+            document.add(name, section)
+    path.write_text(toml.dumps(document), encoding="utf-8")
+
+
+def _toml() -> Any:
+    with optional_import():
+        import tomlkit
+    return tomlkit
 
 
 def _table(entries: Mapping[str, Any], comment: str = "") -> Any:
     """Return a table for TOML: rows of a matrix, and what is long, on lines of their own."""
-    with optional_import():
-        import tomlkit
-    table = tomlkit.table()
+    toml, table = _toml(), _toml().table()
     if comment and comment.isprintable():
-        table.add(tomlkit.comment(comment))
+        table.add(toml.comment(comment))
     for key, part in entries.items():
         item = part
         if key in _COMMENTS:
-            table.add(tomlkit.comment(_COMMENTS[key]))
+            table.add(toml.comment(_COMMENTS[key]))
         if isinstance(part, dict):
-            item = tomlkit.inline_table()
+            item = toml.inline_table()
             item.update(part)
         elif isinstance(part, list):
-            item = tomlkit.array()
+            item = toml.array()
             item.extend(part)
             has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
             item.multiline(has_rows or len(item.as_string()) > _LINE)
@@ -221,11 +227,9 @@ def _table(entries: Mapping[str, Any], comment: str = "") -> Any:
 
 def _colour_table(found: ColourOrder) -> Any:
     """Return the table of a token's colours; where no function is named, the order is assumed."""
-    with optional_import():
-        import tomlkit
     if not found.is_assumed:
         return _table({"order": found.order, "function": found.function})
-    table, order = _table({}, _MARK_RGB), tomlkit.string(found.order)
+    table, order = _table({}, _MARK_RGB), _toml().string(found.order)
     order.comment("assumed").trivia.comment_ws = "  "
     table.add("order", order)
     return table
@@ -373,70 +377,21 @@ def encode_value(value: Any) -> dict[str, Any]:
 
 def _encode(value: Any) -> dict[str, Any]:
     kind = type(value)
-    if value is None:
-        return {_KIND: "none"}
-    if value is Nothing:
-        return {_KIND: "nothing"}
-    if kind in (bool, float) or (kind is int and value in _SMALL):
-        return {"value": value}
-    if kind is str:
-        if any("\ud800" <= character <= "\udfff" for character in value):
-            raise Unwritable("a text with half a character in it")
+    for name, single in _SINGLE.items():
+        if value is single:
+            return {_KIND: name}
+    if kind is str and any("\ud800" <= character <= "\udfff" for character in value):
+        raise Unwritable("a text with half a character in it")
+    if kind in (bool, float, str) or (kind is int and value in _SMALL):
         return {"value": value}
     if kind is list:
         return {"value": _items(value)}
     if kind is dict and _KIND not in value and all(type(key) is str and fits(key) for key in value):
         return {"value": {key: _part(item) for key, item in value.items()}}
-    for name, (python_type, write, _) in _KINDS.items():
-        if kind is python_type:
-            return {"value": write(value), _KIND: name}
-    return _encode_by_name(value)
-
-
-def _encode_by_name(value: Any) -> dict[str, Any]:
-    """Return the entry of a value that names its dtype, its enumeration or its file."""
-    numpy = sys.modules.get("numpy")
-    if is_plain_array(value):
-        return _array(value)
-    if numpy and isinstance(value, numpy.number | numpy.bool_) and _is_exact(value.dtype):
-        return {"value": _of_number(value), _KIND: "numpy", "dtype": value.dtype.name}
-    if isinstance(value, enum.Enum) and value.name in type(value).__members__:
-        return {"value": value.name, _KIND: "enum", "enum": type(value).__qualname__}
-    if isinstance(value, Member):
-        return {"value": value.name, _KIND: "enum", "enum": value.enum}
-    if isinstance(value, StoredArray):
-        return {"value": value.file, _KIND: "file"}
-    raise Unwritable(f"a {type(value).__name__}")
-
-
-def _is_exact(dtype: Any) -> bool:
-    """Whether Python's own numbers hold those of a dtype to the last bit."""
-    return dtype.kind in "biuf" and dtype.itemsize <= 8
-
-
-def _array(array: Any) -> dict[str, Any]:
-    if not _is_exact(array.dtype):
-        raise Unwritable(f"an array of {array.dtype}")
-    if array.size > MOST_NUMBERS:
-        raise Unwritable(f"an array of {array.size} numbers", _TOO_LARGE)
-    import numpy as np
-
-    numbers = np.array([_of_number(number) for number in array.flat], object)
-    dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
-    entry = {"value": numbers.reshape(array.shape).tolist(), _KIND: "array", "dtype": dtype}
-    entry |= {} if array.size else {"shape": list(array.shape)}
-    if decode_value(entry).tobytes() != array.tobytes():
-        raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
-    return entry
-
-
-def _of_number(number: Any) -> Any:
-    """Return a number of NumPy's as the shortest one of Python's that makes it again."""
-    whole = number.item()
-    if number.dtype.kind != "f":
-        return _part(whole)
-    short = float(str(number))
-    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole)
+    for name, one in _KINDS.items():
+        if one.has(value):
+            return {"value": one.write(value), _KIND: name, **one.more(value)}
+    raise Unwritable(f"a {kind.__name__}")
 
 
 def _part(value: Any) -> Any:
@@ -446,22 +401,110 @@ def _part(value: Any) -> Any:
 
 
 def _items(values: Iterable[Any]) -> list[Any]:
-    return [_part(item) for item in values]
+    parts = [_part(item) for item in values]
+    return sorted(parts, key=repr) if isinstance(values, set | frozenset) else parts
 
 
-def _sorted_items(values: Iterable[Any]) -> list[Any]:
-    return sorted(_items(values), key=repr)
+def _is_exact(dtype: Any) -> bool:
+    """Whether Python's own numbers hold those of a dtype to the last bit."""
+    return dtype.kind in "biuf" and dtype.itemsize <= 8
 
 
-# The type of each kind, what stands in an entry for a value of it, and how that makes the value again.
-_KINDS: Final[Mapping[str, tuple[type, Callable[[Any], Any], Callable[[Any], Any]]]] = {
-    "int": (int, hex, lambda text: int(text, 16)),
-    "complex": (complex, lambda value: _items((value.real, value.imag)), lambda parts: complex(*parts)),
-    "bytes": (bytes, bytes.hex, bytes.fromhex),
-    "tuple": (tuple, _items, tuple),
-    "set": (set, _sorted_items, set),
-    "frozenset": (frozenset, _sorted_items, frozenset),
-    "dict": (dict, lambda value: [_items(pair) for pair in value.items()], dict),
+def _is_number_of_numpy(value: Any) -> bool:
+    numpy = sys.modules.get("numpy")
+    return bool(numpy) and isinstance(value, numpy.number | numpy.bool_) and _is_exact(value.dtype)  # type: ignore[union-attr]
+
+
+def _number(number: Any) -> Any:
+    """Return a number of NumPy's as the shortest one of Python's that makes it again."""
+    whole = number.item()
+    if number.dtype.kind != "f":
+        return _part(whole)
+    short = float(str(number))
+    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole)
+
+
+def _numbers(array: Any) -> Any:
+    """Return the numbers of an array, in lists."""
+    if not _is_exact(array.dtype):
+        raise Unwritable(f"an array of {array.dtype}")
+    if array.size > MOST_NUMBERS:
+        raise Unwritable(f"an array of {array.size} numbers", _TOO_LARGE)
+    import numpy as np
+
+    numbers = np.array([_number(number) for number in array.flat], object).reshape(array.shape).tolist()
+    if np.array(_whole(numbers, None), array.dtype).tobytes() != array.tobytes():
+        raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
+    return numbers
+
+
+def _described(value: Any) -> dict[str, Any]:
+    """Return what the entry of an array or number of NumPy's has besides the numbers."""
+    dtype = value.dtype.name if value.dtype.isnative else value.dtype.str
+    return {"dtype": dtype} if value.size else {"dtype": dtype, "shape": list(value.shape)}
+
+
+def _read_numpy(value: Any, entry: Mapping[str, Any], enums: Mapping[str, Any] | None) -> Any:
+    import numpy as np
+
+    dtype = np.dtype(entry["dtype"])
+    if entry[_KIND] == "numpy":
+        return dtype.type(value)
+    array = np.array(value, dtype)
+    return array.reshape(entry.get("shape", array.shape))
+
+
+def _is_member(value: Any) -> bool:
+    return isinstance(value, Member) or (isinstance(value, enum.Enum) and value.name in type(value).__members__)
+
+
+def _enum_of(member: Any) -> dict[str, Any]:
+    return {"enum": member.enum if isinstance(member, Member) else type(member).__qualname__}
+
+
+def _read_member(name: str, entry: Mapping[str, Any], enums: Mapping[str, Any] | None) -> Any:
+    kind = entry["enum"]
+    return enums[kind][name] if enums and kind in enums else Member(kind, name)
+
+
+class _Kind(NamedTuple):
+    """How values of a kind stand in an entry.
+
+    Attributes
+    ----------
+    has
+        Whether a value is of this kind.
+    write
+        Returns what stands in the entry for a value.
+    read
+        Returns the value for what stands there, with the entry and the enumerations by name.
+    more
+        Returns what else the entry of a value has.
+    """
+
+    has: Callable[[Any], bool]
+    write: Callable[[Any], Any]
+    read: Callable[[Any, Mapping[str, Any], Mapping[str, Any] | None], Any]
+    more: Callable[[Any], Mapping[str, Any]] = lambda value: {}
+
+
+def _of_type(kind: type, write: Callable[[Any], Any], read: Callable[[Any], Any]) -> _Kind:
+    return _Kind(lambda value: type(value) is kind, write, lambda value, entry, enums: read(value))
+
+
+_SINGLE: Final[Mapping[str, Any]] = {"none": None, "nothing": Nothing}
+_KINDS: Final[Mapping[str, _Kind]] = {
+    "int": _of_type(int, hex, lambda text: int(text, 16)),
+    "complex": _of_type(complex, lambda value: _items((value.real, value.imag)), lambda parts: complex(*parts)),
+    "bytes": _of_type(bytes, bytes.hex, bytes.fromhex),
+    "tuple": _of_type(tuple, _items, tuple),
+    "set": _of_type(set, _items, set),
+    "frozenset": _of_type(frozenset, _items, frozenset),
+    "dict": _of_type(dict, lambda value: [_items(pair) for pair in value.items()], dict),
+    "file": _of_type(StoredArray, attrgetter("file"), StoredArray),
+    "array": _Kind(is_plain_array, _numbers, _read_numpy, _described),
+    "numpy": _Kind(_is_number_of_numpy, _number, _read_numpy, _described),
+    "enum": _Kind(_is_member, attrgetter("name"), _read_member, _enum_of),
 }
 
 
@@ -487,34 +530,15 @@ def decode_value(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = Non
     TypeError
         It makes no sense.
     """
-    kind = entry.get(_KIND)
-    if kind == "none":
-        return None
-    if kind == "nothing":
-        return Nothing
+    kind: Any = entry.get(_KIND)
+    if kind in _SINGLE:
+        return _SINGLE[kind]
     value = _whole(entry["value"], enums)
     if kind is None:
         return value
-    if isinstance(kind, str) and kind in _KINDS:
-        return _KINDS[kind][2](value)
-    if kind in ("array", "numpy"):
-        return _of_numpy(kind, value, entry)
-    if kind == "enum":
-        name = entry["enum"]
-        return enums[name][value] if enums and name in enums else Member(name, value)
-    if kind == "file":
-        return StoredArray(value)
-    raise TypeError(f"no value has the kind {kind!r}")
-
-
-def _of_numpy(kind: str, value: Any, entry: Mapping[str, Any]) -> Any:
-    import numpy as np
-
-    dtype = np.dtype(entry["dtype"])
-    if kind == "numpy":
-        return dtype.type(value)
-    array = np.array(value, dtype)
-    return array.reshape(entry["shape"]) if "shape" in entry else array
+    if kind not in _KINDS:
+        raise TypeError(f"no value has the kind {kind!r}")
+    return _KINDS[kind].read(value, entry, enums)
 
 
 def _whole(part: Any, enums: Mapping[str, Any] | None) -> Any:
@@ -530,9 +554,6 @@ def members_in(value: Any) -> Iterator[enum.Enum | Member]:
     """Give the members of enumerations that are in a value."""
     if isinstance(value, enum.Enum | Member):
         yield value
-    elif isinstance(value, dict):
-        for pair in value.items():
-            yield from members_in(pair)
-    elif type(value) in (tuple, list, set, frozenset):
-        for item in value:
-            yield from members_in(item)
+    elif isinstance(value, dict | tuple | list | set | frozenset):
+        for part in (*value, *(value.values() if isinstance(value, dict) else ())):
+            yield from members_in(part)
