@@ -13,7 +13,7 @@ import ast
 import importlib.resources
 import os
 import types
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, Final
@@ -33,7 +33,6 @@ _PATH_FUNCTIONS: Final[tuple[Any, ...]] = (
 _PATH_METHODS: Final = frozenset({"joinpath", "resolve", "absolute", "with_name", "with_suffix", "as_posix"})
 # Functions of importlib.resources and pkgutil that take a package and a name.
 _RESOURCE_READERS: Final = frozenset({"read_text", "read_binary", "open_text", "open_binary", "path", "get_data"})
-_UNKNOWN: Final = object()
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,36 +96,23 @@ class PackageData:
     def take_files(self, module: OwnModule, body: Sequence[ast.AST], found: Definition | None) -> None:
         """Take along the files that a function, or the top of a module, reads beside it."""
         names = {**module.names, **(imported_by(found) if found is not None else {})}
-        nodes = [*_executed(body, into_functions=found is not None)]
-        parents = {child: node for node in nodes for child in ast.iter_child_nodes(node)}
         anchors = set(self._anchors[module.name])
-        if found is not None:
-            for node in nodes:
-                if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                    value, name = _path_value(node.value, names), node.targets[0].id
-                    if isinstance(value, str | PurePath) and self._has_anchor(node.value, anchors, names):
-                        if name in anchors and names[name] != value:
-                            what = f"{module.what} has two paths by the name {name!r} ({module.place_in(node)})"
-                            raise Refused(f"{what}, so that its text does not say which files it reads. Use two names.")
-                        names[name] = value
-                        anchors.add(name)
-        is_named: set[ast.AST | None] = set()
-        for node in nodes:
-            if self._is_anchor(node, anchors, names):
-                whole = node
-                while isinstance(_path_value(_around(whole, parents), names), str | PurePath):
-                    whole = _around(whole, parents)
-                is_named.update(ast.walk(whole))
-                if isinstance(_path_value(whole, names), str | PurePath):
-                    self._take(whole, parents, module, names)
-        # Docstrings; and texts of the module's constants, which count where a function reads them.
-        unread = {node.value for node in nodes if isinstance(node, ast.Expr)} | is_named
-        unread |= {node.value for node in nodes if found is None and isinstance(node, ast.Assign | ast.AnnAssign)}
-        for node in nodes:
-            text = getattr(node, "value", None) if isinstance(node, ast.Constant) else None
-            text = names.get(node.id) if found is not None and isinstance(node, ast.Name) else text
-            if type(text) is str and node not in unread:
-                _check_text(text, module, module.place_in(node))
+        for node, parent in _outermost_paths(body, names, into_functions=found is not None):
+            value, is_own = _path_value(node, names), self._has_anchor(node, anchors, names)
+            place = module.place_in(node)
+            if is_own and found is not None and isinstance(parent, ast.Assign):
+                for name in (target.id for target in parent.targets if isinstance(target, ast.Name)):
+                    if name in anchors and names[name] != value:
+                        what = f"{module.what} has two paths by the name {name!r} ({place})"
+                        raise Refused(f"{what}, so that its text does not say which files it reads. Use two names.")
+                    names[name] = value
+                    anchors.add(name)
+            # Texts of the module's constants count where a function reads them.
+            is_unread = isinstance(parent, ast.Assign | ast.AnnAssign) or isinstance(node, ast.Name)
+            if is_own:
+                self._take(Path(value), node, parent, module, place)
+            elif type(value) is str and (found is not None or not is_unread):
+                _check_text(value, module, place)
 
     def _find_anchors(self, module: OwnModule) -> None:
         """Find a module's names for paths that are made of ``__file__``, also those taken from other modules."""
@@ -154,17 +140,13 @@ class PackageData:
                 return name in {*_RESOURCE_READERS, "files"} and isinstance(_path_value(node, names), PurePath)
         return False
 
-    def _take(
-        self, whole: ast.AST, parents: Mapping[ast.AST, ast.AST], module: OwnModule, names: Mapping[str, Any]
-    ) -> None:
-        path, place, parent = Path(_path_value(whole, names)), module.place_in(whole), parents.get(whole)
-        # By a name whose uses are looked at, too; not as an attribute.
-        is_kept = isinstance(parent, ast.Assign) and not isinstance(parents.get(parent), ast.ClassDef)
-        is_kept &= all(isinstance(target, ast.Name) for target in getattr(parent, "targets", ()))
+    def _take(self, path: Path, node: ast.AST, parent: ast.AST | None, module: OwnModule, place: str) -> None:
+        # A folder by a name, whose uses are looked at too.
+        is_kept = isinstance(parent, ast.Assign) and all(isinstance(target, ast.Name) for target in parent.targets)
         is_search_path = isinstance(parent, ast.Call) and ast.unparse(parent.func).startswith("sys.path.")
         if is_search_path or (path.is_dir() and is_kept):
             return
-        what = f"{module.what} reads files beside itself ({place}: {ast.unparse(whole)})"
+        what = f"{module.what} reads files beside itself ({place}: {ast.unparse(node)})"
         if path.is_dir():
             raise Refused(
                 f"{what}, and its text does not say which of {path}. Write the name of each, as in "
@@ -193,79 +175,76 @@ def _check_text(text: str, module: OwnModule, place: str) -> None:
         raise Refused(f"{what}, which a service has not. {way_out}, or pass its content in as a token.")
 
 
-def _executed(body: Iterable[ast.AST], *, into_functions: bool) -> Iterator[ast.AST]:
-    """Give the nodes of some statements; those in functions only if asked for."""
-    waiting = [*body][::-1]
-    while waiting:
-        node = waiting.pop()
-        yield node
-        parts = [*ast.iter_child_nodes(node)]
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not into_functions:
-            parts = [node.args, *getattr(node, "decorator_list", [])]
-        waiting += reversed(parts)
-
-
 # -- paths -------------------------------------------------------------------------------------------------------------
 
 
-def _around(node: ast.AST, parents: Mapping[ast.AST, ast.AST]) -> Any:
-    """Return the expression around one; around what a method is called on, the call."""
-    parent = parents.get(node)
-    is_method = isinstance(parent, ast.Attribute) and parent.attr in _PATH_METHODS
-    return parents.get(parent) if is_method and parent is not None else parent
+def _outermost_paths(
+    body: Sequence[ast.AST], names: Mapping[str, Any], *, into_functions: bool
+) -> Iterator[tuple[ast.AST, ast.AST | None]]:
+    """Give the outermost expressions of paths and texts in what is executed, each with the statement or call it is of.
+
+    What assigns to the attributes of a class is none; docstrings are left out. ``names`` may be added to meanwhile.
+    """
+    waiting: list[tuple[ast.AST, ast.AST | None]] = [(node, None) for node in reversed(body)]
+    while waiting:
+        node, parent = waiting.pop()
+        if isinstance(node, ast.expr) and isinstance(_path_value(node, names), str | PurePath):
+            yield node, parent
+            continue
+        parts = [*ast.iter_child_nodes(node)]
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and not into_functions:
+            parts = [node.args, *getattr(node, "decorator_list", [])]
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            parts = []
+        is_of_class = isinstance(parent, ast.ClassDef) and isinstance(node, ast.Assign)
+        waiting += [(part, None if is_of_class else node) for part in reversed(parts)]
 
 
-def _path_value(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
-    """Return the value of an expression that makes a path of names, texts and functions for paths; else _UNKNOWN."""
+def _path_value(node: ast.AST, names: Mapping[str, Any]) -> Any:
+    """Return the value of an expression that makes a path of names, texts and functions for paths; else None."""
     try:
         return _evaluated(node, names)
     except Refused:
         raise
     except Exception:  # whatever a function for paths raises for what is no path
-        return _UNKNOWN
+        return None
 
 
-def _evaluated(node: ast.AST | None, names: Mapping[str, Any]) -> Any:
+def _evaluated(node: ast.AST, names: Mapping[str, Any]) -> Any:
     match node:
         case ast.Constant(value=str() | int() as value):
             return value
         case ast.Name(id=name):
-            return str if name == "str" and name not in names else names.get(name, _UNKNOWN)
+            return {"str": str, **names}[name]
         case ast.Attribute(value=inner, attr=name):
             value = _evaluated(inner, names)
-            is_open = isinstance(value, types.ModuleType) or (isinstance(value, PurePath) and name[:6] == "parent")
-            return getattr(value, name, _UNKNOWN) if is_open else _UNKNOWN
+            if isinstance(value, types.ModuleType) or (isinstance(value, PurePath) and name[:6] == "parent"):
+                return getattr(value, name)
         case ast.Subscript(value=inner, slice=index):
             return _evaluated(inner, names)[_evaluated(index, names)]
         case ast.BinOp(left=left, op=ast.Div() | ast.Add() as operator, right=right):
             one, other = _evaluated(left, names), _evaluated(right, names)
-            is_sum = isinstance(operator, ast.Add) and isinstance(one, str)
-            return one + other if is_sum else one / other if isinstance(one, PurePath) else _UNKNOWN
+            if isinstance(one, str if isinstance(operator, ast.Add) else PurePath):
+                return one + other if isinstance(operator, ast.Add) else one / other
         case ast.FormattedValue(value=inner, conversion=-1, format_spec=None):
-            return str(_known(_evaluated(inner, names)))
+            return str(_evaluated(inner, names))
         case ast.JoinedStr(values=values):
-            return "".join(_known(_evaluated(value, names)) for value in values)
+            return "".join(_evaluated(value, names) for value in values)
         case ast.Call(keywords=[]):
-            return _called(node, [_known(_evaluated(argument, names)) for argument in node.args], names)
-    return _UNKNOWN
-
-
-def _known(value: Any) -> Any:
-    if value is _UNKNOWN:
-        raise ValueError
-    return value
+            return _called(node, [_evaluated(argument, names) for argument in node.args], names)
+    raise ValueError("no path")
 
 
 def _called(node: ast.Call, arguments: list[Any], names: Mapping[str, Any]) -> Any:
     if isinstance(node.func, ast.Attribute) and node.func.attr in _PATH_METHODS:
-        value = _evaluated(node.func.value, names)
+        value = _path_value(node.func.value, names)
         if isinstance(value, PurePath):
             return getattr(value, node.func.attr)(*arguments)
     function = _evaluated(node.func, names)
     home = str(getattr(function, "__module__", ""))
     is_reader = home.startswith(("importlib.resources", "pkgutil")) and function.__name__ in _RESOURCE_READERS
     if not is_reader and not any(function is one for one in _PATH_FUNCTIONS):
-        return _UNKNOWN
+        raise ValueError("no function for paths")
     if is_reader or function is importlib.resources.files:
         package, *parts = arguments
         if isinstance(node.args[0], ast.Constant) and not is_installed(package):
@@ -273,6 +252,5 @@ def _called(node: ast.Call, arguments: list[Any], names: Mapping[str, Any]) -> A
             place = place_in(str(names.get("__file__")), node.lineno)
             way_out = f"Write {ast.unparse(node.func)}(__package__), and the rest of the path behind it."
             raise Refused(f"{what} ({place}), which a bundle has under another name. {way_out}")
-        found = importlib.resources.files(package)
-        return found.joinpath(*parts) if parts else found
+        function, arguments = importlib.resources.files(package).joinpath, parts
     return function(*arguments)
