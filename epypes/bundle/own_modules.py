@@ -19,8 +19,9 @@ import os
 import shutil
 import sys
 import types
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from importlib.machinery import ModuleSpec, PathFinder
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from pathlib import Path
 from typing import Any, Final
@@ -29,8 +30,8 @@ from epypes.bundle.manifest import OWN_MODULES
 from epypes.bundle.objects import ATOMS, INSTALLED, describe, is_installed, is_of_library, module_reads, without_nodes
 from epypes.bundle.package_data import OwnModule, PackageData
 from epypes.bundle.private_import import loaded_module, plain_name
-from epypes.bundle.references import captured_by, imports_in, is_main_guard, namespace_of
-from epypes.bundle.resolve import Definition, Refused, definition_of, place_in
+from epypes.bundle.references import captured_by, is_main_guard, namespace_of
+from epypes.bundle.resolve import Definition, Refused, as_function, definition_of, imports_in, noted_refusals, place_in
 from epypes.bundle.side_effects import (
     Patches,
     check_notebook_name,
@@ -78,10 +79,8 @@ class OwnModules:
             for name in itertools.accumulate(waiting.pop().split("."), "{}.{}".format):
                 if name not in self._seen:
                     self._seen.add(name)
-                    try:
+                    with noted_refusals(self.refusals):
                         waiting += self._add(name)
-                    except Refused as refusal:
-                        self.refusals.append(str(refusal))
 
     def _add(self, full: str) -> list[str]:
         """Take a module along if it is one of the project; return the names of the modules that it imports."""
@@ -156,38 +155,28 @@ class OwnModules:
         by_file = {str(module.file): module for module in self._modules.values()}
         own_patches = {
             key: place
-            for module in self._modules.values()
-            for key, place in patches_in([(str(module.file), module.text)], module.names).items()
+            for file, module in by_file.items()
+            for key, place in patches_in([(file, module.text)], module.names).items()
             if is_installed(str(getattr(key[0], "__module__", None) or key[0].__name__))
         }
-        known = {**patches, **own_patches}
-        checks: list[tuple[Sequence[ast.AST], Definition | None, OwnModule]]
-        checks = [(module.tree.body, None, module) for module in self._modules.values()]
+        known, data = {**patches, **own_patches}, PackageData(self._modules)
+        for module in self._modules.values():
+            with noted_refusals(self.refusals):
+                data.take_files(module, module.tree.body, None)
         for function in functions:
             home = by_file.get(function.__code__.co_filename)
-            if home is None or function.__code__.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
-                continue
-            try:
-                found = _definition(function, home)
-                check_state(found)
-                check_reads(found, known)
-                for name in found.reads():
-                    if not name.startswith("__") and name not in home.names:
-                        check_notebook_name(name, found)
-                checks.append(([found.node], found, home))
-            except Refused as refusal:
-                self.refusals.append(str(refusal))
-        data = PackageData(self._modules)
-        for body, definition, module in checks:
-            try:
-                data.take_files(module, body, definition)
-            except Refused as refusal:
-                self.refusals.append(str(refusal))
+            if home is not None and not function.__code__.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
+                with noted_refusals(self.refusals):
+                    found = _definition(function, home)
+                    check_state(found)
+                    check_reads(found, known)
+                    for name in found.reads():
+                        if not name.startswith("__") and name not in home.names:
+                            check_notebook_name(name, found)
+                    data.take_files(home, [found.node], found)
         for relative, path in data.files.items():
-            try:
+            with noted_refusals(self.refusals):
                 self._put(relative, path, "File", path)
-            except Refused as refusal:
-                self.refusals.append(str(refusal))
         self.refusals = list(dict.fromkeys(self.refusals))
 
 
@@ -207,9 +196,7 @@ def _definition(function: types.FunctionType, module: OwnModule) -> Definition:
     if node is None:
         place = place_in(code.co_filename, code.co_firstlineno)
         raise Refused(f"{what} is not what its file says ({place}): the file was changed since. {_RESTART}.")
-    if isinstance(node, ast.Lambda):
-        node = ast.copy_location(ast.FunctionDef("<lambda>", node.args, [ast.Return(node.body)], []), node)
-        ast.fix_missing_locations(node)
+    node = as_function(node) if isinstance(node, ast.Lambda) else node
     return Definition(what, node, code.co_filename, lines, namespace_of(function), function, captured_by(function), ())
 
 
@@ -234,23 +221,24 @@ def functions_reached_by(values: Iterable[Any]) -> Iterator[types.FunctionType]:
 def _location(full: str) -> Path | None:
     """Return the file of a module, or the folder of a package without one; None if it has neither, or is not there."""
     loaded = loaded_module(full)
-    parent, _, last = full.rpartition(".")
     if loaded is not None:
         places = [getattr(loaded, "__file__", None), *getattr(loaded, "__path__", ())]
-        return next((Path(place) for place in places if isinstance(place, str)), None)
-    if not parent:
-        try:
-            spec = importlib.util.find_spec(full)
-        except (ImportError, ValueError):
-            return None
+    else:
+        spec = _spec(full)
         places = [spec.origin if spec.has_location else None, *(spec.submodule_search_locations or ())] if spec else []
-        return next((Path(place) for place in places if place), None)
-    above = _location(parent)
-    if above is None or not (above.is_dir() or above.name == "__init__.py"):
-        return None
-    folder = above if above.is_dir() else above.parent
-    candidates = [folder / last / "__init__.py", folder / f"{last}.py", *folder.glob(f"{last}.*.so"), folder / last]
-    return next((path for path in candidates if path.exists()), None)
+    return next((Path(place) for place in places if isinstance(place, str)), None)
+
+
+def _spec(full: str) -> ModuleSpec | None:
+    """Return how a module would be imported, without an import of the packages around it."""
+    parent = full.rpartition(".")[0]
+    with suppress(ImportError, ValueError):
+        if not parent:
+            return importlib.util.find_spec(full)
+        above = loaded_module(parent) or _spec(parent)
+        path = getattr(above, "__path__", None) or getattr(above, "submodule_search_locations", None)
+        return PathFinder.find_spec(full, [*path]) if path else None
+    return None
 
 
 def _root(name: str, path: Path) -> Path:

@@ -21,8 +21,7 @@ from typing import Any, Final
 from epypes.bundle.file_access import ON_EVERY_MACHINE
 from epypes.bundle.objects import INSTALLED, is_installed
 from epypes.bundle.private_import import plain_name
-from epypes.bundle.references import imports_in
-from epypes.bundle.resolve import Definition, Refused, place_in
+from epypes.bundle.resolve import Definition, Refused, imports_in, place_in
 from epypes.bundle.side_effects import imported_by
 
 _PICKLES: Final = frozenset({".pkl", ".pickle", ".joblib"})

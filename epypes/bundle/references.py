@@ -51,31 +51,24 @@ def global_names(code: types.CodeType) -> list[str]:
 
 def imported_modules(function: types.FunctionType) -> list[str]:
     """Return the names of all modules that a function may import when it runs, as Python knows them, sorted."""
-    package = function.__globals__.get("__package__") or ""
+    return imports_of(function.__code__, function.__globals__)
+
+
+def imports_of(code: types.CodeType, names: Mapping[str, Any]) -> list[str]:
+    """Return the names of all modules that code may import, as Python knows them, sorted; ``names`` are its own."""
+    package = names.get("__package__") or ""
     found: set[str] = set()
-    for code in nested_codes(function.__code__):
+    for inner in nested_codes(code):
         # Before each import statement, its level and the names that it takes are loaded.
-        steps = [one for one in dis.get_instructions(code) if one.opname in {*_LOADS_CONSTANT, "IMPORT_NAME"}]
+        steps = [one for one in dis.get_instructions(inner) if one.opname in {*_LOADS_CONSTANT, "IMPORT_NAME"}]
         for level, taken, step in zip(steps, steps[1:], steps[2:], strict=False):
             if step.opname == "IMPORT_NAME":
                 with suppress(ImportError):  # a relative import beyond the package
                     name = importlib.util.resolve_name("." * level.argval + step.argval, package)
-                    name = name if level.argval else name_meant(name, function.__globals__)
+                    name = name if level.argval else name_meant(name, names)
                     # A name that is taken from a package may be a module of it.
                     found |= {name, *(f"{name}.{one}" for one in taken.argval or ())}
     return sorted(found)
-
-
-def imports_in(tree: ast.AST, names: Mapping[str, Any]) -> list[str]:
-    """Return the modules that the import statements of a text may name, as Python knows them; ``names`` are its own."""
-    found: dict[str, None] = {}
-    for node in (node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)):
-        for alias in node.names:
-            with suppress(ImportError):  # a relative import beyond the package
-                module = module_of_import(node, alias, names)
-                # A name that is taken from a package may be a module of it.
-                found |= {module: None} | ({f"{module}.{alias.name}": None} if isinstance(node, ast.ImportFrom) else {})
-    return [*found]
 
 
 def module_of_import(node: ast.Import | ast.ImportFrom, alias: ast.alias, names: Mapping[str, Any]) -> str:

@@ -21,13 +21,14 @@ import sys
 import types
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, Final, TypeGuard
 
 from epypes.bundle.private_import import loaded_module
-from epypes.bundle.references import captured_by, global_names, may_remember, namespace_of, nested_codes
+from epypes.bundle.references import captured_by, global_names, imports_of, may_remember, namespace_of, nested_codes
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
 from epypes.wording import keep_as_state
@@ -46,6 +47,15 @@ _Functions = dict[tuple[str, int], tuple[list[ast.FunctionDef | ast.Lambda], lis
 
 class Refused(Exception):
     """One reason why something can't be promoted; collected, then raised together as PromotionRefused."""
+
+
+@contextmanager
+def noted_refusals(reasons: list[str]) -> Iterator[None]:
+    """Note what is refused inside, and go on after it."""
+    try:
+        yield
+    except Refused as refusal:
+        reasons.append(str(refusal))
 
 
 # -- what can be imported --------------------------------------------------------------------------------------------
@@ -282,6 +292,12 @@ def compiled(tree: ast.Module, flags: int = 0) -> types.CodeType | None:
         return None
 
 
+def imports_in(node: ast.AST, names: Mapping[str, Any]) -> list[str]:
+    """Return the modules that the import statements of a text may name, as ``imports_of`` does for its code."""
+    code = compiled(node if isinstance(node, ast.Module) else ast.Module([node], []))  # type: ignore[list-item]
+    return imports_of(code, names) if code is not None else []
+
+
 def computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
     """Whether two pieces of code are the same, but for the place where they stand."""
     return _bare(one) == _bare(other)
@@ -439,7 +455,7 @@ def function_definition(function: Any, what: str) -> Definition:
     if code.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
         raise Refused(f"{what} is asynchronous ({place}), which no graph waits for. Write a plain function (def).")
     lines, node = definition_of(code)
-    node = _as_function(node) if isinstance(node, ast.Lambda) else node
+    node = as_function(node) if isinstance(node, ast.Lambda) else node
     if not lines:
         way_out = "Define it in a cell without %%time, in a file, or in a module that is installed"
         way_out += ": Python keeps no text of what is typed at a prompt."
@@ -461,7 +477,7 @@ _MARKS: Final = (unguarded, outputs)
 _LEAVING: Final = (unguarded, functools.wraps)
 
 
-def _as_function(node: ast.Lambda) -> ast.FunctionDef:
+def as_function(node: ast.Lambda) -> ast.FunctionDef:
     """Return a lambda as a function that is called so until its name is known."""
     body: list[ast.stmt] = [ast.copy_location(ast.Return(node.body), node.body)]
     return ast.copy_location(ast.FunctionDef("function", node.args, body, []), node)

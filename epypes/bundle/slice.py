@@ -12,8 +12,8 @@ import re
 import sys
 import tokenize
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, TypeVar
@@ -36,7 +36,7 @@ from epypes.bundle.expressions import (
 )
 from epypes.bundle.objects import is_installed
 from epypes.bundle.private_import import import_module, loaded_module, plain_name
-from epypes.bundle.references import imports_in, is_of_ipython, may_remember
+from epypes.bundle.references import is_of_ipython, may_remember
 from epypes.bundle.resolve import (
     LATE_ANNOTATIONS,
     Definition,
@@ -52,7 +52,9 @@ from epypes.bundle.resolve import (
     first_line,
     function_definition,
     importable,
+    imports_in,
     names_of,
+    noted_refusals,
     with_defaults,
 )
 from epypes.bundle.side_effects import (
@@ -141,13 +143,9 @@ class Slice:
         self._notebook: Mapping[str, Any] = {}
         self.patches = patches_in_notebook()
 
-    @contextmanager
-    def noted_refusals(self) -> Iterator[None]:
+    def noted_refusals(self) -> AbstractContextManager[None]:
         """Note what is refused inside, and go on after it."""
-        try:
-            yield
-        except Refused as refusal:
-            self.refusals.append(str(refusal))
+        return noted_refusals(self.refusals)
 
     # -- names -------------------------------------------------------------------------------------------------------
 
