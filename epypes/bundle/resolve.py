@@ -213,43 +213,33 @@ def lines_in(file: str) -> list[str]:
 
 
 def definition_of(code: types.CodeType) -> tuple[list[str], ast.FunctionDef | ast.Lambda | None]:
-    """Return the lines that code is from, and the definition among them that compiles to this very code.
-
-    Of several lambdas on one line it is the innermost around the columns of the code; where Python has no columns, they
-    must all have one text.
-    """
-    lines, nodes = _nodes_of(code)
-    if code.co_name != "<lambda>":
-        return lines, next((node for node in nodes if isinstance(node, ast.FunctionDef)), None)
-    # Some versions of Python put the return at the line's beginning, without a text.
-    places: list[Any] = [place for place in code.co_positions() if None not in place and place[::2] != place[1::2]]
-    starts, ends = [(place[0], place[2]) for place in places], [(place[1], place[3]) for place in places]
-    lambdas = [node for node in nodes if isinstance(node, ast.Lambda)]
-    around = [node for node in lambdas if starts and _start(node.body) <= min(starts) and max(ends) <= _end(node.body)]
-    found = [max(around, key=lambda node: _start(node.body))] if around else lambdas
-    is_one = len(found) == 1 or len({ast.dump(node) for node in found}) == 1
-    return lines, found[0] if is_one else None
-
-
-def _start(node: ast.expr) -> tuple[int, int]:
-    return node.lineno, node.col_offset
-
-
-def _end(node: ast.expr) -> tuple[int, int]:
-    return node.end_lineno or 0, node.end_col_offset or 0
-
-
-def _nodes_of(code: types.CodeType) -> tuple[list[str], list[ast.FunctionDef | ast.Lambda]]:
-    """Return the lines that code is from, and what stands at its place if that compiles to this very code."""
+    """Return the lines that code is from, and the definition among them that compiles to this very code."""
     linecache.checkcache(code.co_filename)  # a script may have been changed and run again
     lines = lines_in(code.co_filename)
     functions = _functions_in("".join(lines), code.co_flags & LATE_ANNOTATIONS)
     nodes, codes = functions.get((code.co_name, code.co_firstlineno), ([], []))
     same = [other for other in codes if computes_the_same(other, code)]
+    if code.co_name != "<lambda>":
+        return lines, next((node for node in nodes if same and isinstance(node, ast.FunctionDef)), None)
     # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
-    if code.co_name == "<lambda>":
-        same = [other for other in same if other.co_linetable == code.co_linetable]
-    return lines, nodes if same else []
+    is_same = any(other.co_linetable == code.co_linetable for other in same)
+    return lines, _lambda_of(code, [node for node in nodes if isinstance(node, ast.Lambda)]) if is_same else None
+
+
+def _lambda_of(code: types.CodeType, lambdas: Sequence[ast.Lambda]) -> ast.Lambda | None:
+    """Return the innermost lambda around the columns of its code; without columns, one if all have the same text."""
+    # Some versions of Python put the return at the line's beginning, without a text.
+    places: list[Any] = [place for place in code.co_positions() if None not in place and place[::2] != place[1::2]]
+    if places:
+        start, end = min(place[::2] for place in places), max(place[1::2] for place in places)
+        around = [
+            node
+            for node in lambdas
+            if (node.body.lineno, node.body.col_offset) <= start
+            and end <= (node.body.end_lineno or 0, node.body.end_col_offset or 0)
+        ]
+        lambdas = [max(around, key=lambda node: (node.body.lineno, node.body.col_offset))] if around else lambdas
+    return lambdas[0] if len({ast.dump(node) for node in lambdas}) == 1 else None
 
 
 @lru_cache(maxsize=16)  # one cell often defines many functions
