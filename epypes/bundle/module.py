@@ -24,15 +24,14 @@ from epypes.bundle.expressions import (
     expression_or_none,
     identifier_of,
     laid_out,
-    names_in,
     quoted,
 )
 from epypes.bundle.load import MAKER, WITH_DELAYS
 from epypes.bundle.objects import without_nodes
 from epypes.bundle.own_modules import OwnModules
-from epypes.bundle.resolve import Position, Refused, parsed
+from epypes.bundle.resolve import Refused, parsed
 from epypes.bundle.settings import Settings, members_in
-from epypes.bundle.slice import Slice, gather
+from epypes.bundle.slice import Slice, Written, gather
 from epypes.errors import run_call
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import FullPipeline, Node, Pipeline, SinkPipeline, SourcePipeline
@@ -84,7 +83,7 @@ def write_module(
     own[WITH_DELAYS] = bool(settings.states)
 
     def write(gathered: Slice) -> tuple[dict[str, str], str]:
-        graphs, definitions = Graphs(gathered), gathered.definitions
+        graphs = Graphs(gathered)
         references, others = graphs.write(cg), dict[str, str]()
         for name, adapter in adapters.items():
             reference = graphs.value(adapter, f"Function {name!r}", name)
@@ -93,18 +92,18 @@ def write_module(
             elif reference != name:
                 with gathered.noted_refusals():
                     gathered.reserve(name)
-                definitions[name] = f"{_ADAPTER_COMMENTS[name]}\n{name} = {reference}"
+                gathered.define(name, f"{_ADAPTER_COMMENTS[name]}\n{name} = {reference}")
         if others:
             with gathered.noted_refusals():
                 gathered.reserve(ADAPTERS)
             comment = "# The names of these mean other functions or values in this module."
-            definitions[ADAPTERS] = f"{comment}\n{_dict(ADAPTERS, others)}"
+            gathered.define(ADAPTERS, f"{comment}\n{_dict(ADAPTERS, others)}")
         if pipeline is not None:
             with gathered.noted_refusals():
-                definitions[MAKER] = graphs.maker(pipeline)
+                gathered.define(MAKER, graphs.maker(pipeline))
         kinds = {name: graphs.value(kind, f"Class {name!r} of a hyperparameter", name) for name, kind in enums.items()}
         if kinds:
-            definitions["enums"] = f"# Whose members stand in pipeline.toml.\n{_dict('enums', kinds)}"
+            gathered.define("enums", f"# Whose members stand in pipeline.toml.\n{_dict('enums', kinds)}")
         return references, graphs.with_delays(cg)
 
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
@@ -245,7 +244,7 @@ class Graphs:
 
     def _variable(self, name: str, source: str, comment: str = "") -> str:
         variable = self.gathered.free_name(name)
-        self.gathered.definitions[variable] = comment + "\n".join(laid_out(source, before=f"{variable} = "))
+        self.gathered.define(variable, comment + "\n".join(laid_out(source, before=f"{variable} = ")))
         return variable
 
     def _switch(self, cg: CompGraph, name: str, switch: Switch, what: str) -> str:
@@ -274,8 +273,8 @@ class Graphs:
         variables = self.gathered.free_name(f"{name}_functions"), self.gathered.free_name(f"{name}_io")
         ends = f"{', '.join(cg.source_tokens) or 'nothing'} -> {', '.join(cg.sink_tokens) or 'nothing'}"
         comment = f"# {escaped(f'A graph of its own: {ends}.', 80)}"
-        self.gathered.definitions[variables[0]] = f"{comment}\n{_dict(variables[0], references)}"
-        self.gathered.definitions[variables[1]] = _io(variables[1], cg)
+        self.gathered.define(variables[0], f"{comment}\n{_dict(variables[0], references)}")
+        self.gathered.define(variables[1], _io(variables[1], cg))
         epypes = self.gathered.module_name("epypes", what)
         source = f"{epypes}.CompGraph({', '.join(variables)}{'' if cg.types else ', types=False'})"
         for group, members in cg.groups.items():
@@ -337,18 +336,16 @@ def _class_of(made: Node, what: str) -> str:
 
 def module_text(needed: Slice, tail: str, head: str = "") -> str:
     """Return the text of a module: what stands at its head, what its functions need, and what stands behind that."""
-    texts = {name: text.rstrip() for name, text in needed.definitions.items()}
-    positions = needed.positions | {name: one.position for name, one in needed.constants.items() if one.position}
-    early: list[str] = []
-    for name, known in sorted(needed.constants.items(), key=lambda item: (not item[1].position, item[1].position)):
-        if names_in(known.source) & needed.definitions.keys():
-            texts[name] = "\n".join(known.lines)
-        else:
-            early += ["", *known.lines] if early and known.lines[0].startswith("#") else known.lines
+    written = needed.written
+    definitions = {name for name, one in written.items() if not one.source}
+    in_order = sorted(written.items(), key=lambda item: (not item[1].position, item[1].position))
+    first = [one.text for _, one in in_order if one.source and not one.reads & definitions]
+    early = [f"\n{text}" if number and text.startswith("#") else text for number, text in enumerate(first)]
     sections = ["\n\n".join(filter(None, [head, _import_lines(needed.imports.values()), "\n".join(early)]))]
-    for are_constants, names in itertools.groupby(_ordered(texts, positions, needed), needed.constants.__contains__):
-        found = [texts[name] for name in names]
-        sections += ["\n".join(found)] if are_constants else found
+    others = {name: one for name, one in in_order if not one.source or one.reads & definitions}
+    for are_constants, found in itertools.groupby(_ordered(others), lambda one: bool(one.source)):
+        texts = [one.text for one in found]
+        sections += ["\n".join(texts)] if are_constants else texts
     return "\n\n\n".join(filter(None, [*sections, tail])) + "\n"
 
 
@@ -363,45 +360,40 @@ def _import_lines(statements: Iterable[str]) -> str:
     return "\n\n".join("\n".join(part) for _, part in itertools.groupby(in_order, section))
 
 
-def _ordered(texts: Mapping[str, str], positions: Mapping[str, Position], needed: Slice) -> list[str]:
-    """Return the names of definitions in the order of the notebook, each behind what importing it reads.
-
-    What the notebook has nowhere stands before what needs it, or at the end.
-    """
-    mentioned = {name: needed.reads[name] if name in needed.reads else names_in(text) for name, text in texts.items()}
-    by_position = sorted(texts, key=lambda name: (name not in positions, positions.get(name, ())))
-    found: dict[str, None] = {}
+def _ordered(written: Mapping[str, Written]) -> list[Written]:
+    """Return definitions, which are in the order of the notebook, each behind what importing it reads."""
+    found: dict[str, Written] = {}
     begun: set[str] = set()
 
     def place(name: str) -> None:
         if name not in begun:
             begun.add(name)
-            needs = _needs(texts[name], mentioned, name in needed.closures)
-            for other in by_position:
+            needs = _needs(written[name], written)
+            for other in written:
                 if other in needs:
                     place(other)
-            found[name] = None
+            found[name] = written[name]
 
-    for name in by_position:
+    for name in written:
         place(name)
-    return [*found]
+    return [*found.values()]
 
 
-def _needs(text: str, mentioned: Mapping[str, Iterable[str]], is_closure: bool) -> set[str]:
+def _needs(one: Written, written: Mapping[str, Written]) -> set[str]:
     """Return the definitions that importing one reads; what it calls may read all that it mentions.
 
     What makes a closure calls nothing of what it is given.
     """
-    tree = parsed(text) or ast.Module([], [])
+    tree = parsed(one.text) or ast.Module([], [])
     for part in ast.walk(tree):
         if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef):
             part.body = []  # is not executed at import
     parts = [*ast.walk(tree)]
-    found = {part.id for part in parts if isinstance(part, ast.Name) and part.id in mentioned}
+    found = {part.id for part in parts if isinstance(part, ast.Name) and part.id in written}
     calls = any(isinstance(part, ast.Call | ast.ClassDef) or getattr(part, "decorator_list", []) for part in parts)
-    pending = [*found] if calls and not is_closure else []
+    pending = [*found] if calls and not one.is_closure else []
     while pending:
-        more = (mentioned.keys() & mentioned[pending.pop()]) - found
+        more = (written.keys() & written[pending.pop()].reads) - found
         found |= more
         pending += more
     return found

@@ -506,6 +506,16 @@ def _no_definition(value: Any, innermost: Any, what: str) -> str:
 # -- the parts of definitions ----------------------------------------------------------------------------------------
 
 
+def defaults_in(given: ast.arguments) -> dict[str, ast.expr]:
+    """Return the expressions of the defaults of a function, by parameter."""
+    parameters = [*given.posonlyargs, *given.args][::-1]
+    pairs = [
+        *zip(parameters, given.defaults[::-1], strict=False),
+        *zip(given.kwonlyargs, given.kw_defaults, strict=True),
+    ]
+    return {parameter.arg: default for parameter, default in pairs if default is not None}
+
+
 def with_defaults(given: ast.arguments, new: Mapping[ast.expr, ast.expr]) -> ast.arguments:
     """Return the parameters of a function with other defaults."""
     given = copy.copy(given)

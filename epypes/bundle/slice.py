@@ -36,7 +36,7 @@ from epypes.bundle.expressions import (
 )
 from epypes.bundle.objects import is_installed
 from epypes.bundle.private_import import import_module, loaded_module, plain_name
-from epypes.bundle.references import is_of_ipython, may_remember
+from epypes.bundle.references import defaults_of, is_of_ipython, may_remember
 from epypes.bundle.resolve import (
     LATE_ANNOTATIONS,
     Definition,
@@ -48,6 +48,7 @@ from epypes.bundle.resolve import (
     cell_of,
     class_definition,
     comment_above,
+    defaults_in,
     evaluated,
     first_line,
     function_definition,
@@ -87,6 +88,31 @@ def gather(
     return gathered, write(gathered)
 
 
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What stands in a module under a name.
+
+    Attributes
+    ----------
+    text
+        Its lines, with the comments of the notebook.
+    reads
+        The names that it reads from outside.
+    position
+        The cell and line where the notebook has it, or gave it this value; () if no text says that.
+    source
+        Of a constant, the expression that makes it.
+    is_closure
+        Whether it is a call that makes a closure.
+    """
+
+    text: str
+    reads: frozenset[str]
+    position: Position = ()
+    source: str = ""
+    is_closure: bool = False
+
+
 class Slice:
     """What a module needs, gathered from several functions.
 
@@ -105,16 +131,8 @@ class Slice:
         The arrays that are stored in files.
     imports
         Import statements, by the name that each binds and what it binds it to.
-    constants
-        Values, by name.
-    definitions
-        Text of functions, classes and closures, by name.
-    positions
-        Where the notebook has them, as far as that is known.
-    reads
-        The names that they read from outside.
-    closures
-        The names of closures.
+    written
+        What stands in the module, by name: functions, classes, closures and constants.
     modules
         The modules that all of it imports, by the names that Python knows them by.
     refusals
@@ -127,21 +145,16 @@ class Slice:
         self.arrays = ArrayFiles(CONSTANTS)
         self.read: dict[str, object] = {}
         self.imports: dict[tuple[str, str], str] = {}
-        self.constants: dict[str, Constant] = {}
-        self.definitions: dict[str, str] = {}
-        self.positions: dict[str, Position] = {}
-        self.reads: dict[str, frozenset[str]] = {}
-        self.closures: set[str] = set()
+        self.written: dict[str, Written] = {}
         self.modules: set[str] = set()
         self.refusals: list[str] = []
-        self._stores_arrays = stores_arrays
-        self._reserved = reserved
+        self.patches = patches_in_notebook()
+        self._stores_arrays, self._reserved = stores_arrays, reserved
         self._meanings: dict[str, Meaning] = {}
         self._known: dict[int, str] = {}
         self._unfinished: set[str] = set()
         self._makers: dict[tuple[str, str], str] = {}
         self._notebook: Mapping[str, Any] = {}
-        self.patches = patches_in_notebook()
 
     def noted_refusals(self) -> AbstractContextManager[None]:
         """Note what is refused inside, and go on after it."""
@@ -186,6 +199,10 @@ class Slice:
             return False
         return is_identifier(name) and not hasattr(builtins, name) and name not in sys.modules
 
+    def define(self, name: str, text: str, reads: Collection[str] | None = None, **more: Any) -> None:
+        """Write a definition under a name; without ``reads`` it reads all that its text names."""
+        self.written[name] = Written(text.rstrip(), frozenset(names_in(text) if reads is None else reads), **more)
+
     # -- imports -----------------------------------------------------------------------------------------------------
 
     def reference(self, home: Importable, what: str) -> str:
@@ -210,23 +227,19 @@ class Slice:
 
     def _import_module(self, module: str, name: str, what: str) -> None:
         plain = plain_name(module)
+        bound, named = (plain.partition(".")[0], "") if name == plain else (name, f" as {name}")
+        home = module if named else module.removesuffix(plain) + bound
+        self.claim(bound, _of_object(loaded_module(home)), what)
         self.modules.add(module)
-        if name == plain:
-            top = plain.partition(".")[0]
-            self.claim(top, _of_object(loaded_module(module[: len(module) - len(plain)] + top)), what)
-            self.imports[name, module] = f"import {plain}"
-        else:
-            self.claim(name, _of_object(loaded_module(module)), what)
-            self.imports[name, module] = f"import {plain} as {name}"
+        self.imports[name, module] = f"import {plain}{named}"
 
     def store_array(self, array: Any, name: str, what: str) -> str:
         """Store an array as a file; return the call that reads it, or "" if files can't hold it or there are none."""
         if not self._stores_arrays or not is_storable(array):
             return ""
-        if READER not in self.definitions:
+        if READER not in self.written:
             self.reserve(READER)
-            self.definitions[READER] = reader_text(*(self.module_name(module, what) for module in ("numpy", "pathlib")))
-            self.reads[READER] = frozenset()
+            self.define(READER, reader_text(*(self.module_name(module, what) for module in ("numpy", "pathlib"))), ())
         return f'{READER}("{self.arrays.add(array, name)}")'
 
     # -- functions and classes ---------------------------------------------------------------------------------------
@@ -239,7 +252,7 @@ class Slice:
         if id(kind) not in self._known:
             found = class_definition(kind, self._notebook or vars(sys.modules["__main__"]), what)
             check_state(found)
-            self.claim(kind.__name__, _of_object(kind), what)
+            self.claim(kind.__name__, _of_object(kind), f"{what} ({found.place_in(found.node)})")
             self._known[id(kind)] = kind.__name__
             self._write(kind.__name__, _text(found, kind.__name__), found)
         return self._known[id(kind)]
@@ -300,9 +313,9 @@ class Slice:
             above = comment_above(found.lines, first_line(node)) if node is not None else []
             self._write(factory, "\n".join([*above, f"def {factory}{whole}"]), found, {*given, inner})
         arguments = ", ".join(f"{each}={source}" for each, source in given.items())
-        self.definitions[name] = f"{name} = {self._makers[around, whole]}({arguments})\n"
-        self.positions[name] = _position(found)
-        self.closures.add(name)
+        self.define(
+            name, f"{name} = {self._makers[around, whole]}({arguments})", position=_position(found), is_closure=True
+        )
 
     def _name_for(self, function: object, found: Definition, wanted: str) -> str:
         """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
@@ -313,15 +326,13 @@ class Slice:
 
     def _changed_defaults(self, found: Definition) -> dict[ast.expr, str]:
         """Return expressions of the defaults whose text makes another value than the function has."""
-        function, node, changed = found.function, found.node, dict[ast.expr, str]()
-        if function is None or not isinstance(node, ast.FunctionDef):
-            return {}
-        values = [*zip(node.args.defaults[::-1], (function.__defaults__ or ())[::-1], strict=False)]
-        by_name = [*zip(node.args.kw_defaults, node.args.kwonlyargs, strict=True)]
-        known = function.__kwdefaults__ or {}
-        values += [(default, known[one.arg]) for default, one in by_name if default and one.arg in known]
-        for default, value in values:
-            if not _makes(default, value, found.names):
+        changed: dict[ast.expr, str] = {}
+        if found.function is None or not isinstance(found.node, ast.FunctionDef):
+            return changed
+        nodes = defaults_in(found.node.args)
+        for parameter, value in defaults_of(found.function).items():
+            default = nodes.get(parameter)
+            if default is not None and not _makes(default, value, found.names):
                 text = f"the default {ast.unparse(default)!r} ({found.place_in(default)})"
                 reason = f"{found.what} has {text}, which no short expression makes again"
                 changed[default] = self._short(value, f"{found.what}, by {text},", reason)
@@ -352,15 +363,12 @@ class Slice:
         """Write a definition, after what it reads from outside but for the names that are its own."""
         self._notebook = self._notebook or found.names
         check_reads(found, self.patches)
-        read = found.reads()
+        read = [one for one in found.reads() if one not in own]
         self.modules.update(imports_in(found.node, found.names))
-        self.reads[name] = frozenset(read) - {*own}
         for needed in read:
-            if needed not in own:
-                with self.noted_refusals():
-                    self._add_name(needed, found, found.what)
-        self.definitions[name] = text
-        self.positions[name] = _position(found)
+            with self.noted_refusals():
+                self._add_name(needed, found, found.what)
+        self.define(name, text, read, position=_position(found))
 
     # -- what definitions read by name -------------------------------------------------------------------------------
 
@@ -399,8 +407,9 @@ class Slice:
         source = self._short(value, inner, f"{text}, of type {type(value).__name__}", name, name)
         if source != name:
             self.claim(name, ("constant", source), what)
-            if name not in self.constants:
-                self.constants[name] = constant(name, source, value, found.names, found.file)
+            if name not in self.written:
+                lines, position = _lines_of_constant(name, source, value, found)
+                self.define(name, "\n".join(lines), names_in(source), position=position, source=source)
 
     def _add_builtin(self, name: str, found: Definition) -> None:
         """Add a name that is no global of the notebook."""
@@ -415,10 +424,10 @@ class Slice:
 
     def add_constant(self, name: str, source: str) -> str:
         """Add a constant that the notebook has under no name; return its name, which is like this one."""
-        known = next((name for name, known in self.constants.items() if known.source == source), "")
+        known = next((name for name, one in self.written.items() if one.source == source), "")
         if not known:
             known = self.free_name(name)
-            self.constants[known] = Constant(source, tuple(laid_out(source, before=f"{known} = ")))
+            self.define(known, "\n".join(laid_out(source, before=f"{known} = ")), names_in(source), source=source)
         return known
 
 
@@ -475,47 +484,26 @@ def _lines_in_strings(text: str) -> set[int]:
 # -- constants -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Constant:
-    """A constant as it stands in a module.
-
-    Attributes
-    ----------
-    source
-        The expression that makes it.
-    lines
-        Its lines, with the comments of the notebook.
-    position
-        The cell and line where the notebook gave it this value; () if its text does not say.
-    """
-
-    source: str
-    lines: tuple[str, ...]
-    position: Position = ()
-
-
-def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file: str) -> Constant:
-    """Return a constant as the notebook has it where it last gave the name this value, with its comments.
+def _lines_of_constant(name: str, source: str, value: Any, found: Definition) -> tuple[list[str], Position]:
+    """Return a constant as the notebook has it where it last gave the name this value, with its comments, and where.
 
     Parameters
     ----------
     name, source, value
         The constant, and the expression that makes it again.
-    names
-        The notebook's names.
-    file
-        The file of a function that reads it.
+    found
+        A function that reads it.
     """
     own = laid_out(source, before=f"{name} = ")
-    found = assignment_of(name, names, file)
-    if found is None:
-        return Constant(source, tuple(own))
-    node, lines, cell = found
-    given = node.value or ast.Constant(None)
+    assignment = assignment_of(name, found.names, found.file)
+    if assignment is None:
+        return own, ()
+    node, lines, cell = assignment
+    position, given = (cell, node.lineno), node.value or ast.Constant(None)
     is_alone = isinstance(node, ast.AnnAssign) or [*map(type, getattr(node, "targets", ()))] == [ast.Name]
     written = literal_value(given) if is_alone else UNKNOWN
     if not is_alone or (written is not UNKNOWN and not is_same_data(written, value)):
-        return Constant(source, tuple(own), (cell, node.lineno))
+        return own, position
     behind = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
     beside = behind if behind.startswith("#") else ""
     computed = f"# {ast.unparse(given)} in the notebook"
@@ -529,7 +517,7 @@ def constant(name: str, source: str, value: Any, names: Mapping[str, Any], file:
         own[-1] = together
     elif beside:
         above.append(beside)
-    return Constant(source, (*above, *own), (cell, node.lineno))
+    return [*above, *own], position
 
 
 # -- meanings and values ----------------------------------------------------------------------------------------------
