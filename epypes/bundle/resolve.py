@@ -508,11 +508,8 @@ def _no_definition(value: Any, innermost: Any, what: str) -> str:
 
 def defaults_in(given: ast.arguments) -> dict[str, ast.expr]:
     """Return the expressions of the defaults of a function, by parameter."""
-    parameters = [*given.posonlyargs, *given.args][::-1]
-    pairs = [
-        *zip(parameters, given.defaults[::-1], strict=False),
-        *zip(given.kwonlyargs, given.kw_defaults, strict=True),
-    ]
+    parameters = [*given.posonlyargs, *given.args][-len(given.defaults) :] if given.defaults else []
+    pairs = zip([*parameters, *given.kwonlyargs], [*given.defaults, *given.kw_defaults], strict=True)
     return {parameter.arg: default for parameter, default in pairs if default is not None}
 
 
