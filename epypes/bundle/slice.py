@@ -252,7 +252,7 @@ class Slice:
         if id(kind) not in self._known:
             found = class_definition(kind, self._notebook or vars(sys.modules["__main__"]), what)
             check_state(found)
-            self.claim(kind.__name__, _of_object(kind), f"{what} ({found.place_in(found.node)})")
+            self.claim(kind.__name__, _of_object(kind), f"{what.rstrip(',')} ({found.place_in(found.node)})")
             self._known[id(kind)] = kind.__name__
             self._write(kind.__name__, _text(found, kind.__name__), found)
         return self._known[id(kind)]

@@ -170,3 +170,13 @@ def test_a_class_that_was_defined_again_is_taken_as_it_is_now():
     cg = ep.CompGraph({"f": names["f"]}, {"f": ("x", "y")})
     text = emit_module(Settings("case", ("x",), ("y",), {}), cg, needed, references)
     assert executed(text).func_dict["f"](1) == names["f"](1) == 8
+
+
+def test_a_class_whose_cell_was_run_again_is_refused_with_its_line_where_something_is_of_the_old_one():
+    source = "\nimport enum\nclass Mode(enum.Enum):\n    FAST = 1\n"
+    names = cell(f"{source}CHOSEN = Mode.FAST\ndef f(x):\n    return x + (CHOSEN is Mode.FAST)\n")
+    cell(source, names)
+    needed, _ = slice_graph({"f": names["f"]})
+    (reason,) = needed.refusals
+    assert re.search(r"Class 'Mode', which function 'f' uses \(<test cell \d+>, line 3\) uses the name 'Mode'", reason)
+    assert "run again what was made of it" in reason
