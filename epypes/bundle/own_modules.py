@@ -304,12 +304,16 @@ class PackageData:
                         raise Refused(f"{what}, so that its text does not say which files it reads. Use two names.")
                     names[name] = value
                     anchors.add(name)
-            # Texts of the module's constants count where a function reads them.
-            is_unread = isinstance(parent, ast.Assign | ast.AnnAssign) or isinstance(node, ast.Name)
             if is_own:
                 self._take(Path(value), node, parent, module, place)
-            elif type(value) is str and (found is not None or not is_unread):
-                _check_text(value, module, place)
+                continue
+            # Texts of the module's constants count where a function reads them.
+            is_unread = found is None and isinstance(parent, ast.Assign | ast.AnnAssign)
+            for part in ast.walk(node):
+                text = getattr(part, "value", None) if isinstance(part, ast.Constant) and not is_unread else None
+                text = names.get(part.id) if found is not None and isinstance(part, ast.Name) else text
+                if type(text) is str:
+                    _check_text(text, module, place)
 
     def _find_anchors(self, module: OwnModule) -> None:
         """Find a module's names for paths that are made of ``__file__``, also those taken from other modules."""

@@ -306,6 +306,10 @@ READS = {
     "a file outside": ("np.loadtxt(HERE.parent.parent / 'out.txt')", r"out\.txt is outside of .*project"),
     "a pickle": ("np.load(HERE / 'model.pkl', allow_pickle=True)", r"model\.pkl is a pickle"),
     "the current folder": ("np.loadtxt('here.txt')", r"names 'here\.txt', a file in the current folder \(.*line 8\)"),
+    "a path in the current folder": (
+        "np.loadtxt(Path('here.txt'))",
+        r"names 'here\.txt', a file in the current folder \(.*line 8\)",
+    ),
     "an absolute path": (
         "np.loadtxt(ABSOLUTE)",
         r"names '/.*/project/lib/a\.txt' \(.*line 8\), which a service has not",
