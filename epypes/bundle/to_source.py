@@ -356,7 +356,11 @@ class _Function:
         nothings = [token for token, value in values.items() if value is Nothing]
         nothings += [previous for previous in delays if cg.delays[previous].initial is Nothing]
         self.finders, self.may_be_nothing = self._find_nothing(nothings)
-        self.nothing = module.expression("Nothing", Nothing, _NO_EXPRESSION) if self.may_be_nothing else ""
+        compared = {cg.delays[previous].token for previous in delays}
+        compared.update(*(cg.func_inputs(each) for each in self.calls))
+        compared.update(*(cg.func_outputs(each) for each in self.finders if not cg.has_single_output(each)))
+        is_compared = not compared.isdisjoint(self.may_be_nothing)
+        self.nothing = module.expression("Nothing", Nothing, _NO_EXPRESSION) if is_compared else ""
         keys = chain.from_iterable(values for switch in self.switches.values() for values in switch.values())
         sources = {*self.calls.values(), *keys, *filter(None, [self.copy, self.nothing])}
         self.taken = {name for source in sources for name in names_in(source)} | {"ValueError"}

@@ -38,12 +38,17 @@ def lone(*values):
     return (mixed(*values),)
 
 
+def some(*values):
+    value = mixed(values)
+    return value if value % 3 else ep.Nothing
+
+
 def seen(*values):
     LOG.append(values)
 
 
 MAKERS = {"mixed": (mixed, "1"), "two": (two, 2), "five": (five_values_that_have_a_function_of_a_long_name, 5),
-          "lone": (lone, 1), "seen": (seen, 0), "max": (max, "1")}  # fmt: skip
+          "lone": (lone, 1), "some": (some, "1"), "seen": (seen, 0), "max": (max, "1")}  # fmt: skip
 ODD = ["x y", "lambda", "zlib", "l", "O", "ValueError", "größe", "画像", "画像 1", "ﬁ", "a.b", "x" * 60, "1st", "\n", '"""',
        "match", "max", "tests", "print", "__debug__", "run_graph", "None", "_", "a", "a_", "a__2", "A", "\\", "e\u0301", "a\u00a0b",
        "number_of_octave_layers_in_pyramid", "가", "\u200b", "\U0001d431", "if", "if_", "'\"", "lambda ", "z" * 30, "f(x)", "{x}", "\ud800"]  # fmt: skip
