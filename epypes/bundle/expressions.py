@@ -20,7 +20,7 @@ from datetime import timedelta
 from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
-from typing import TYPE_CHECKING, Annotated, Any, Final, Union, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 from epypes.bundle.resolve import Importable, Refused, importable
 from epypes.nothing import Nothing
@@ -234,17 +234,20 @@ class _Writer:
         gathered, what = self.gathered, self.what
         if isinstance(value, types.ModuleType):
             return gathered.module_name(value.__name__, what)
-        if get_origin(value) is Annotated:
-            annotated = gathered.reference(Importable("typing", "Annotated"), what)
-            return f"{annotated}[{self._joined((value.__origin__, *value.__metadata__))}]"
         if value is ...:
             return "..."
         if value is Nothing:
             return gathered.reference(Importable("epypes", "Nothing"), what)
         if isinstance(value, types.UnionType):
             return " | ".join(map(self.write, value.__args__))
-        if isinstance(value, types.GenericAlias) or (get_origin(value) is Union and type(value).__module__ == "typing"):
-            return f"{self.write(get_origin(value))}[{self._joined(value.__args__)}]"
+        origin = get_origin(value)
+        if origin is Annotated:
+            return f"{self.write(Annotated)}[{self._joined((value.__origin__, *value.__metadata__))}]"
+        if origin is Callable:
+            *given, result = value.__args__
+            return f"{self.write(origin)}[{'...' if given == [...] else self.write(given)}, {self.write(result)}]"
+        if origin is not None:
+            return f"{self.write(origin)}[{self._joined(value.__args__)}]"
         home = importable(value)
         if home is not None:
             return gathered.reference(home, what)

@@ -67,6 +67,13 @@ SLICED = {
         'K = Annotated[int, ep.Param(1, 31, odd=True, unit="\'")]\ndef f(x: K):\n    return x + 1\n',
         4,
     ),
+    "annotations of all kinds": (
+        "from collections.abc import Callable\nfrom typing import Literal, Optional, Union\n"
+        "A, B = Callable[[int, str], int], Callable[..., int]\nC, D = Literal['a', 'b'], Optional[list[int]]\n"
+        "E, F = Union[int, None], dict[str, tuple[int, ...]] | None\n"
+        "def f(x: A, a: B = None, c: C = 'a', d: D = None, e: E = 1, g: F = None):\n    return x + e\n",
+        4,
+    ),
     "plain": ("def f(x):\n    return x + 1\n", 4),
     "comment above": ("# Adds one.\ndef f(x):\n    return x + 1  # really\n", 4),
     "constant": ("STEP = 2\ndef f(x):\n    return x + STEP\n", 5),
