@@ -66,8 +66,9 @@ def to_source(
     their values as defaults. Functions that can be imported are imported; those of the notebook are written above it,
     and so is a function for every Pipeline in the graph. A switch becomes an ``if``.
 
-    The function of a graph with delays takes the state by keyword too, with the initial values as defaults. It returns
-    a pair: what it returns otherwise, and the state for the next call: ``y, state = run_graph(x, **state)``.
+    The function of a graph with delays takes the state by keyword too, with the initial values as defaults; that of a
+    pipeline in the graph is a dict, which begins empty. It returns a pair: what it returns otherwise, and the state for
+    the next call: ``y, state = run_graph(x, **state)``.
 
     Parameters
     ----------
@@ -262,30 +263,24 @@ def _refers_to_nothing(function: Any) -> bool:
 
 
 class _State(NamedTuple):
-    """What is kept from one call of a function to the next.
+    """What a delay keeps from one call of a function to the next.
 
     Attributes
     ----------
     parameter
         The variable that it comes in, also its key in the state that the function returns.
-    default
-        The expression of its initial value.
     maker
         The function of the graph that makes it; "" if the caller does.
     after
         The expression of what the call leaves, where the maker is called.
     following
         The variable that has it in the end where the maker is not always called; else "".
-    inner
-        Of what a pipeline keeps, the parameter of its function; else "".
     """
 
     parameter: str
-    default: str
     maker: str
     after: str
     following: str
-    inner: str
 
 
 class _Function:
@@ -325,10 +320,10 @@ class _Function:
         By token.
     taken
         The names that no variable may have.
-    left
-        By pipeline with state, the variable of the state that it has left.
     states
-        What is kept for the next call.
+        What its delays keep for the next call.
+    inner_states
+        By pipeline with state, the variable of that, before its call and after it.
     """
 
     def __init__(
@@ -368,8 +363,8 @@ class _Function:
         reserved, written = frozenset(self.taken), [token for token in cg.tokens if token in tokens or token in delays]
         written.sort(key=lambda token: not is_identifier(token) or token in reserved)
         self.variables = {token: self._variable(token) for token in written}
-        self.left = {name: self._variable(f"{name}_state") for name in keepers}
-        self.states = [*self._states(delays)]
+        self.states = [*map(self._state, delays)]
+        self.inner_states = {name: self._variable(f"{name}_state") for name in keepers}
         module.texts.append(self._text())
 
     def _find_places(self, delays: Iterable[str], keepers: Iterable[str], *, is_whole: bool) -> set[str]:
@@ -456,36 +451,23 @@ class _Function:
         self.taken.add(found)
         return found
 
-    def _states(self, delays: Iterable[str]) -> Iterator[_State]:
-        """Give what is kept for the next call."""
-        cg, variables = self.cg, self.variables
-        for previous in delays:
-            token = cg.delays[previous].token
-            maker, variable, after = cg.digraph.producer.get(token, ""), variables[previous], variables[token]
-            if token in self.may_be_nothing:
-                after = f"{variable} if {after} is {self.nothing} else {after}"
-            yield _State(variable, self.defaults[previous], maker, after, self._following(variable, maker), "")
-        for name, left in self.left.items():
-            is_left_out = bool(self._asked(name, self.may_be_nothing))
-            for inner in self.module.pipelines[id(without_nodes(cg.functions[name]))].states:
-                variable, after = self._variable(f"{name}_{inner.parameter}"), f'{left}["{inner.parameter}"]'
-                following = self._following(variable, name, is_left_out=is_left_out)
-                yield _State(variable, inner.default, name, after, following, inner.parameter)
-
-    def _following(self, parameter: str, maker: str, *, is_left_out: bool = False) -> str:
-        """Return the variable of the state in the end if what makes it is not always called; else ""."""
-        is_in_branch = maker in self.places and bool(self.places[maker].region)
-        return self._variable(f"next_{parameter}") if is_in_branch or is_left_out else ""
+    def _state(self, previous: str) -> _State:
+        token, variable = self.cg.delays[previous].token, self.variables[previous]
+        maker, after = self.cg.digraph.producer.get(token, ""), self.variables[token]
+        is_in_branch = maker in self.places and self.places[maker].region
+        if token in self.may_be_nothing:
+            after = f"{variable} if {after} is {self.nothing} else {after}"
+        return _State(variable, maker, after, self._variable(f"next_{variable}") if is_in_branch else "")
 
     # -- its text ------------------------------------------------------------------------------------------------------
 
     def _text(self) -> str:
         """Return the function."""
-        variables, states = self.variables, self.states
+        variables, states, inner_states = self.variables, self.states, self.inner_states.values()
         sources = [token for token in self.cg.source_tokens if token in variables]
         given = [variables[token] for token in sources if token not in self.defaults]
         named = [f"{variables[token]}={self.defaults[token]}" for token in sources if token in self.defaults]
-        named += [f"{each.parameter}={each.default}" for each in states if each.inner]
+        named += [f"{each}={{}}" for each in inner_states]
         given += ["*", *named] if named else []
         head = f"def {self.name}({', '.join(given)}):"
         lines = [head] if len(head) <= LINE else [f"def {self.name}(", *(f"    {each}," for each in given), "):"]
@@ -493,11 +475,12 @@ class _Function:
         lines += [f"    {each.following} = {each.parameter}" for each in states if each.following]
         lines += self._lines(())
         returned = ", ".join(variables[token] for token in self.returns)
-        if states:
-            after = ", ".join(f'"{each.parameter}": {each.following or each.after}' for each in states)
-            returned = f"{f'({returned})' if len(self.returns) > 1 else returned or None}, {{{after}}}"
+        after = [f'"{each.parameter}": {each.following or each.after}' for each in states]
+        after += [f'"{each}": {each}' for each in inner_states]
+        if after:
+            returned = f"{f'({returned})' if len(self.returns) > 1 else returned or None}, {{{', '.join(after)}}}"
         if returned:
-            is_line = not (states or len(self.returns) > 1) or len(returned) + len("    return ") <= LINE
+            is_line = not (after or len(self.returns) > 1) or len(returned) + len("    return ") <= LINE
             lines += [f"    return {returned}"] if is_line else laid_out(f"({returned})", 1, "return ")
         return "\n".join(lines)
 
@@ -507,7 +490,7 @@ class _Function:
         if len(returned) > LINE - len('    """Return ."""'):
             returned = f"{len(self.returns)} values"
         summary = f"Return {returned}." if returned else "Run."
-        if self.states:
+        if self.states or self.inner_states:
             summary = f"{summary[:-1]}, and the state for the next call." if returned else "Return None, and the state."
         other = [token for token in dict.fromkeys(shown) if self.variables[token] != token]
         if not other:
@@ -549,12 +532,11 @@ class _Function:
         arguments = [self.variables[token] for token in self.cg.func_inputs(name)]
         for place in self._copied(name):
             arguments[place] = f"{self.copy}({arguments[place]})"
-        arguments += [
-            f"{state.inner}={state.parameter}" for state in self.states if state.maker == name and state.inner
-        ]
+        state = self.inner_states.get(name)
+        arguments += [f"**{state}"] if state else []
         call = f"{self.calls[name]}({', '.join(arguments)})"
         outputs = [self.variables[token] for token in self.cg.func_outputs(name)]
-        left = f", {self.left[name]} = " if name in self.left else ""
+        left = f", {state} = " if state else ""
         if self.cg.has_single_output(name) or not outputs or name not in self.finders:
             targets = self._targets(name)
             if left:

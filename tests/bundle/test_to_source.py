@@ -514,6 +514,12 @@ def step(x, before):
 """
 
 
+def flat(state):
+    """Return the values of a state, also those of pipelines in the graph."""
+    parts = [flat(value) if isinstance(value, dict) else [value] for value in state.values()]
+    return [value for part in parts for value in part]
+
+
 def with_state():
     """Return graphs with state by what is special about them, with payloads of a series."""
     names = notebook(STATE_CELL)
@@ -559,7 +565,7 @@ def test_a_graph_with_state_takes_and_returns_it(what):
         value, state = function(*(payload[token] for token in runner.free_source_tokens), **state)
         expected = tuple(run[token] for token in cg.sink_tokens)
         assert (value if len(expected) > 1 else (value,)) == expected
-        assert [*state.values()] == [*run.state.values()]
+        assert flat(state) == [*run.state.values()]
 
 
 def test_state_reads_as_a_colleague_would_have_written_it():
@@ -573,6 +579,11 @@ def track(x, *, before=None, k=0.5):
 ''')
     text = ep.to_source(cg, {"k": 0.5}, returns=["mixed", "y"])
     assert 'return (mixed, y), {"before": mixed}' in text
+    cg, _ = with_state()["a pipeline in a branch"]
+    text = ep.to_source(cg, {"mode": "on"})
+    assert 'def run_graph(x, *, mode="on", inner_state={}):' in text
+    assert "        y, inner_state = inner(x, **inner_state)\n" in text
+    assert 'return chosen, {"inner_state": inner_state}\n' in text
     cg, _ = with_state()["a branch"]
     text = ep.to_source(cg, {"k": 0.5})
     assert "    next_before = before\n    if mode == " in text
@@ -632,7 +643,7 @@ def test_a_pipeline_with_state_may_take_and_make_nothing(where):
         run = runner.run(x=x)
         found, state = run_graph(x, **how, **state)
         assert (found if len(cg.sink_tokens) > 1 else (found,)) == tuple(run[token] for token in cg.sink_tokens)
-        assert [*state.values()] == [*run.state.values()]
+        assert flat(state) == [*run.state.values()]
 
 
 def test_state_stays_as_it_was_where_what_it_takes_is_nothing_by_now():
