@@ -416,7 +416,7 @@ def _evaluated(node: ast.AST, names: Mapping[str, Any]) -> Any:
         case ast.Constant(value=str() | int() as value):
             return value
         case ast.Name(id=name):
-            return {"str": str, **names}[name]
+            return names[name] if name != "str" or name in names else str
         case ast.Attribute(value=inner, attr=name):
             value = _evaluated(inner, names)
             if isinstance(value, types.ModuleType) or (isinstance(value, PurePath) and name[:6] == "parent"):
