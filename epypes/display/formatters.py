@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.display.layout.geometry import Direction
+from epypes.display.layout import Direction
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
 from epypes.display.paint.paper import save_on_paper
 from epypes.display.paint.svg import alt_text, paint_svg

@@ -10,7 +10,7 @@ from itertools import islice
 from statistics import fmean
 from typing import Final, NamedTuple
 
-from epypes.display.layout.geometry import Layout, Point
+from epypes.display.layout import Layout, Point
 from epypes.display.paint.vertices import LINE_PX, text_lines, text_width, vertex
 from epypes.display.text import content, fitted, short_name, wrapped
 from epypes.display.views.graphview import GraphView, StageView

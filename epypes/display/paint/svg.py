@@ -12,8 +12,7 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final
 
-from epypes.display.layout.geometry import Edge, Layout, Point
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import Edge, Layout, Point, lay_out
 from epypes.display.paint.stages import paint_around
 from epypes.display.paint.style import STYLE
 from epypes.display.paint.vertices import function_box, paint_function, paint_token, token_box

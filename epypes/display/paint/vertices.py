@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final
 
-from epypes.display.layout.geometry import Box, Direction, Point
+from epypes.display.layout import Box, Direction, Point
 from epypes.display.previews.model import Chart, Picture, Preview
 from epypes.display.previews.short import float_text
 from epypes.display.text import (

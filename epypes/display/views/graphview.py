@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Final, Literal, NamedTuple
 
-from epypes.display.layout.geometry import Direction as Direction
+from epypes.display.layout import Direction as Direction
 from epypes.display.previews.model import Picture, Preview
 from epypes.images import Order
 
