@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Final
 
 from epypes.display.layout import Box, Direction, Point
-from epypes.display.previews.model import Chart, Picture, Preview
+from epypes.display.previews import Chart, Picture, Preview
 from epypes.display.previews.short import float_text
 from epypes.display.text import (
     CHARACTERS_OF_A_VERTEX,

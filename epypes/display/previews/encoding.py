@@ -15,9 +15,9 @@ import zlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.display.previews import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
 from epypes.display.previews.images import Range, display_range, image_kind, is_mask, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
-from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from PIL import Image
 
-    from epypes.display.previews.model import Array
+    from epypes.display.previews import Array
     from epypes.images import Order
 
 JPEG_QUALITY: Final = 80

@@ -13,7 +13,7 @@ from epypes.display.text import memory_text
 from epypes.wording import counted
 
 if TYPE_CHECKING:
-    from epypes.display.previews.model import Array
+    from epypes.display.previews import Array
 
 
 Range = tuple[float, float]

@@ -159,29 +159,23 @@ def _is_written_by_fields(kind: type) -> bool:
     return type(made) is FunctionType and "__create_fn__" in made.__qualname__
 
 
-_is_in_preview: Final = ContextVar("_is_in_preview", default=False)
-
-
 def silent_numpy() -> AbstractContextManager[Any]:
     """Return what keeps numpy from warning of numbers that overflow or are none: they are counted, and shown."""
     numpy = sys.modules.get("numpy")
     return nullcontext() if numpy is None else numpy.errstate(all="ignore")
 
 
-@contextmanager
-def preview_context() -> Iterator[bool]:
-    """Look at a value: numpy keeps silent about numbers that overflow.
+_is_in_users_code: Final = ContextVar("_is_in_users_code", default=False)
+# Whether a preview function or a repr of a user's runs meanwhile. One that shows the run that its own value is in would
+# never come to an end: values are named only.
+is_in_users_code: Final = _is_in_users_code.get
 
-    Yields
-    ------
-    bool
-        Whether another value is being looked at meanwhile, since a function or repr of a user's shows a picture. One
-        that shows the run that its own value is in would never come to an end.
-    """
-    is_nested = _is_in_preview.get()
-    token = _is_in_preview.set(True)
+
+@contextmanager
+def users_code() -> Iterator[None]:
+    """Call what a user has written of a value."""
+    token = _is_in_users_code.set(True)
     try:
-        with silent_numpy():
-            yield is_nested
+        yield
     finally:
-        _is_in_preview.reset(token)
+        _is_in_users_code.reset(token)

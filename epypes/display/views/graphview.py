@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Final, Literal, NamedTuple
 
 from epypes.display.layout import Direction as Direction
-from epypes.display.previews.model import Picture, Preview
+from epypes.display.previews import Picture, Preview
 from epypes.images import Order
 
 # For each vertex.
