@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import io
-import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
@@ -30,9 +29,8 @@ _MOST_PNG_PX: Final = 20_000
 # What the layout gives a character, and a line beside its characters.
 _CHARACTER_PX: Final = 6.9
 _BESIDE_PX: Final = 12.0
-_NUMBER: Final = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_COMMAND: Final = re.compile(rf"([MLHVCAZmlhvcaz])|({_NUMBER})")
-_NUMBERS_OF: Final = {"m": 2, "l": 2, "h": 1, "v": 1, "c": 6, "a": 7, "z": 0}
+_COMMAND: Final = re.compile("([MLHVCZlhvcz])([^A-Za-z]*)")
+_NUMBER: Final = re.compile(r"-?[\d.]+")
 # Whatever a user has set for plots.
 _PLAIN: Final[Any] = {"text.usetex": False, "path.sketch": None, "path.effects": [], "pdf.fonttype": 42}
 
@@ -211,50 +209,20 @@ def _number(element: ElementTree.Element, name: str) -> float:
 def _steps(written: str) -> Iterator[tuple[Point, int]]:
     """Give the points of a path with Matplotlib's code for each: 1 moves, 2 is a line, 4 a curve, 79 closes."""
     at = start = (0.0, 0.0)
-    for name, numbers in _commands(written):
-        kind, x, y = name.lower(), *(at if name.islower() else (0.0, 0.0))
+    for name, text in _COMMAND.findall(written):
+        kind, numbers = name.lower(), [float(number) for number in _NUMBER.findall(text)]
+        x, y = at if name.islower() else (0.0, 0.0)
         if kind == "z":
             at = start
             yield at, 79
-        elif kind == "a":
-            end = x + numbers[5], y + numbers[6]
-            yield from _arc(at, end, numbers[0], is_large=bool(numbers[3]), is_sweep=bool(numbers[4]))
-            at = end
+            continue
+        if kind == "h":
+            points = [(x + numbers[0], at[1])]
+        elif kind == "v":
+            points = [(at[0], y + numbers[0])]
         else:
-            if kind in "hv":
-                numbers = (numbers[0], 0.0 if name.islower() else at[1])
-                numbers = numbers if kind == "h" else (0.0 if name.islower() else at[0], numbers[0])
             points = [(x + dx, y + dy) for dx, dy in zip(numbers[::2], numbers[1::2], strict=True)]
-            for point in points:
-                yield point, {"m": 1, "c": 4}.get(kind, 2)
-            at = points[-1]
-            start = at if kind == "m" else start
-
-
-def _commands(written: str) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Give the commands of a path with their numbers; one that is repeated is written once."""
-    name, numbers = "", list[float]()
-    for command, number in _COMMAND.findall(written):
-        if command:
-            name, numbers = command, []
-        else:
-            numbers.append(float(number))
-        if len(numbers) == _NUMBERS_OF[name.lower()]:
-            yield name, tuple(numbers)
-            name, numbers = {"M": "L", "m": "l"}.get(name, name), []
-
-
-def _arc(start: Point, end: Point, radius: float, *, is_large: bool, is_sweep: bool) -> Iterator[tuple[Point, int]]:
-    """Give an arc of a circle as lines."""
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    half = math.hypot(dx, dy) / 2
-    away = math.sqrt(max(radius**2 - half**2, 0.0)) * (-1 if is_large == is_sweep else 1)
-    centre = (
-        (start[0] + end[0]) / 2 - away * dy / (2 * half),
-        (start[1] + end[1]) / 2 + away * dx / (2 * half),
-    )
-    first, last = (math.atan2(y - centre[1], x - centre[0]) for x, y in (start, end))
-    turn = (last - first) % math.tau if is_sweep else -((first - last) % math.tau)
-    for step in range(1, 25):
-        angle = first + turn * step / 24
-        yield (centre[0] + radius * math.cos(angle), centre[1] + radius * math.sin(angle)), 2
+        for point in points:
+            yield point, {"m": 1, "c": 4}.get(kind, 2)
+        at = points[-1]
+        start = at if kind == "m" else start

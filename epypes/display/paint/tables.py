@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from epypes.display.paint.stages import stage_words
 from epypes.display.paint.times import TimesView, report_times, summary_times
+from epypes.display.paint.vertices import stage_words
 from epypes.display.previews.short import reason
 from epypes.display.text import content, cut, cut_name, duration_text, fitted, size
 from epypes.display.views.graphview import FunctionView, GraphView, StageView, TokenView
