@@ -27,6 +27,7 @@ from epypes.display.text import (
     escape,
     fitted,
     short_name,
+    shortened,
     wrapped,
     written_length,
 )
@@ -316,7 +317,7 @@ def _kind(token: TokenView) -> str:
 
 def _rows(shown: Preview, left: float, top: float) -> str:
     """Paint rows with their blanks, which keep columns apart, in what they may take."""
-    rows = [row if len(row) <= _ROW_CHARACTERS else row[: _ROW_CHARACTERS - 1] + "…" for row in shown.rows[:_ROWS]]
+    rows = [shortened(row, _ROW_CHARACTERS) for row in shown.rows[:_ROWS]]
     return "".join(
         f'<text class="row" x="{left:.0f}" y="{top + place * _ROW_PX:.0f}">'
         f"{content(row if written_length(row) <= _ROW_ROOM else fitted(row, _ROW_ROOM))}</text>"

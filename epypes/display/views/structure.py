@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 
 from epypes.display.previews.preview import preview
 from epypes.display.previews.short import without_addresses
-from epypes.display.text import cut
+from epypes.display.text import cut, listed, shortened
 from epypes.display.views.graphview import (
     EdgeView,
     FunctionState,
@@ -147,11 +147,9 @@ def _redefined_caption(redefined: Mapping[str, bool]) -> str:
         f"{'a function inside ' * is_inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
         for name, is_inside in redefined.items()
     ]
-    some = ", ".join(names[:_NAMED])
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    verb = "was" if len(names) == 1 else "were"
+    some, verb = listed(names, _NAMED), "was" if len(names) == 1 else "were"
     start = some[0].upper() + some[1:]
-    return f"{start}{more} {verb} redefined since the graph was built: run the cell that builds it again"
+    return f"{start} {verb} redefined since the graph was built: run the cell that builds it again"
 
 
 # -- signatures and sources ----------------------------------------------------------------------------------------
@@ -216,7 +214,7 @@ def _signature_text(function: Any) -> str:
     if len(text) > SIGNATURE_CHARACTERS:
         plain = [each.replace(annotation=each.empty) for each in short]
         text = without_addresses(str(signature.replace(parameters=plain, return_annotation=signature.empty)))
-    return _shortened(text, SIGNATURE_CHARACTERS)
+    return shortened(text, SIGNATURE_CHARACTERS)
 
 
 def _source(function: Any) -> str:
@@ -250,7 +248,7 @@ def _documentation(function: Any) -> str:
     if isinstance(function, FunctionType) or not callable(function):
         return ""
     lines = (inspect.getdoc(function) or "")[:10_000].splitlines()[: SOURCE_LINES - 1]
-    return "\n".join([_DOCUMENTED, *(_shortened(line.rstrip(), LINE_CHARACTERS) for line in lines)]) if lines else ""
+    return "\n".join([_DOCUMENTED, *(shortened(line.rstrip(), LINE_CHARACTERS) for line in lines)]) if lines else ""
 
 
 def _graph_lines(cg: CompGraph) -> str:
@@ -264,11 +262,7 @@ def _graph_lines(cg: CompGraph) -> str:
 def _first_lines(lines: Sequence[str]) -> str:
     kept = [line.rstrip().expandtabs(4) for line in lines[:SOURCE_LINES]]
     margin = min((len(line) - len(line.lstrip()) for line in kept if line), default=0)
-    short = [_shortened(line[margin:], LINE_CHARACTERS) for line in kept]
+    short = [shortened(line[margin:], LINE_CHARACTERS) for line in kept]
     if len(lines) > SOURCE_LINES:
         short[-1] = "…"
     return "\n".join(short)
-
-
-def _shortened(text: str, characters: int) -> str:
-    return text if len(text) <= characters else text[: characters - 1] + "…"

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, Protocol, get_args
+from typing import Any, Final, get_args
 
 from epypes.display.previews.short import reason
 from epypes.display.text import (
@@ -16,6 +16,7 @@ from epypes.display.text import (
     THUMBNAIL_CHARACTERS,
     cut,
     duration_text,
+    listed,
     overhead_text,
     short_name,
 )
@@ -37,25 +38,6 @@ _STAGE_STATES: Final = ("static", "running", "stopped", "failed")
 _NOTE_CHARACTERS: Final = 200
 _MOST_STAGES: Final = 12
 _MOST_NOTES: Final = 6
-
-
-class PipelineLike(Protocol):
-    """What is shown of a pipeline."""
-
-    @property
-    def name(self) -> str:
-        """Stands on the frame."""
-
-    @property
-    def runner(self) -> CompGraphRunner:
-        """Is shown inside the frame."""
-
-    @property
-    def stages(self) -> Any:
-        """Has ``before`` and ``after``: records with kind, name, state and notes."""
-
-
-Shown = CompGraph | CompGraphRunner | Run | Plan | PipelineLike
 
 
 def view(
@@ -123,7 +105,7 @@ def _graph_of(shown: Any) -> CompGraph:
     return runner.cg
 
 
-def _whole(shown: Shown, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
+def _whole(shown: Any, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     """Look at all functions; thumbnails that are in closed groups are dropped first."""
     if isinstance(shown, CompGraph):
         # Tokens with a default are shown as the hyperparameters that a runner makes of them.
@@ -245,8 +227,8 @@ def _with_running(graph: GraphView, running: Sequence[str]) -> GraphView:
         else function
         for function in graph.functions
     )
-    more = f" and {len(running) - _NAMED} more" * (len(running) > _NAMED)
-    return _captioned(graph, f"running: {', '.join(map(short_name, running[:_NAMED]))}{more}", functions=functions)
+    names = listed([short_name(name) for name in running], _NAMED)
+    return _captioned(graph, f"running: {names}", functions=functions)
 
 
 # -- plans ---------------------------------------------------------------------------------------------------------
@@ -285,21 +267,16 @@ def _plan_caption(plan: Plan) -> str:
         parts.append(f"{placeholders} still to be written")
     text = ", ".join(parts)
     if plan.targets:
-        text += f"; asked for: {_some(plan.targets)}"
+        text += f"; asked for: {listed(plan.targets, _NAMED)}"
     if plan.missing:
-        text += f"; missing: {_some(plan.missing)}: call {run_call(plan.missing[:_NAMED])}"
+        text += f"; missing: {listed(plan.missing, _NAMED)}: call {run_call(plan.missing[:_NAMED])}"
     return text
-
-
-def _some(names: tuple[str, ...]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 # -- pipelines -----------------------------------------------------------------------------------------------------
 
 
-def _in_pipeline(graph: GraphView, pipeline: PipelineLike) -> GraphView:
+def _in_pipeline(graph: GraphView, pipeline: Any) -> GraphView:
     """Return the view of a pipeline's graph with the frame and the stages around it.
 
     Stages that can't be had are left out: they come from properties that users may override.
