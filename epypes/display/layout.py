@@ -493,14 +493,13 @@ def _unfolded(layout: Layout, graph: Folded, edges: Sequence[Edge], routed: Sequ
             centres[member] = (x + offset[0], y + offset[1])
             ways[member] = tuple((x + dx, y + dy) for dx, dy in way)
     found = dict(zip(routed, layout.splines, strict=True))
-    splines = tuple(_joined(ways.get(edge[0], ()), found[graph.folded(edge)], ways.get(edge[1], ())) for edge in edges)
-    return Layout(layout.width, layout.height, tuple(centres), splines)
-
-
-def _joined(out: Way, spline: Way, into: Way) -> Way:
-    """Let a spline begin with the way out of a block and end with that into one; they meet, but for rounding."""
-    start = (*out, *spline[1:]) if out else spline
-    return (*start[:-2], *into) if into else start
+    splines = []
+    for tail, head in edges:
+        spline = found[graph.folded((tail, head))]
+        # It begins with the way out of a block and ends with that into one; they meet, but for rounding.
+        spline = (*ways[tail], *spline[1:]) if tail in ways else spline
+        splines.append((*spline[:-2], *ways[head]) if head in ways else spline)
+    return Layout(layout.width, layout.height, tuple(centres), tuple(splines))
 
 
 def _alike(boxes: Sequence[Box], edges: Sequence[Edge], apart: Collection[int]) -> list[tuple[int, ...]]:
@@ -538,19 +537,13 @@ def _arranged(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: flo
 def _upside_down(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]]) -> Block:
     """Arrange sinks: their edges come from the middle of the block's top."""
     block = _arranged(boxes, rows[::-1], _TIP_PX)
-
-    def over(points: Iterable[Point]) -> Way:
-        return tuple((x, -y) for x, y in points)
-
-    ways = tuple(over((*reversed(way), _tip(*way[:2]))) for way in block.ways)
-    return Block(block.box, block.members, over(block.offsets), ways)
-
-
-def _tip(end: Point, control: Point) -> Point:
-    """Return the tip of an arrow that goes on where a way ends, from its last control point."""
-    (x, y), (dx, dy) = end, (end[0] - control[0], end[1] - control[1])
-    scale = _TIP_PX / math.hypot(dx, dy)
-    return x + dx * scale, y + dy * scale
+    ways = []
+    for way in block.ways:
+        # The tip of the arrow goes on where the way ends, from its last control point.
+        (x, y), (dx, dy) = way[0], (way[0][0] - way[1][0], way[0][1] - way[1][1])
+        scale = _TIP_PX / math.hypot(dx, dy)
+        ways.append(tuple((x, -y) for x, y in (*reversed(way), (x + dx * scale, y + dy * scale))))
+    return Block(block.box, block.members, tuple((x, -y) for x, y in block.offsets), tuple(ways))
 
 
 def _row(boxes: Sequence[Box], members: tuple[int, ...], tip_px: float) -> Block:

@@ -81,19 +81,12 @@ def _without_stops(spline: Sequence[Point]) -> list[Point]:
     way = list(spline[:1])
     for first in range(0, len(spline) - 1, 3):
         curve = spline[first : first + 4]
-        if _is_straight(way[-4:]) and _is_straight(curve) and _are_in_line(way[-4], *curve[::3]):
+        are_straight = all(len(each) == 4 and each[0] == each[1] and each[2] == each[3] for each in (way[-4:], curve))
+        if are_straight and any(len(set(along)) == 1 for along in zip(way[-4], *curve[::3], strict=True)):
             way[-2:] = curve[2:]
         else:
             way += curve[1:]
     return way
-
-
-def _is_straight(curve: Sequence[Point]) -> bool:
-    return len(curve) == 4 and curve[0] == curve[1] and curve[2] == curve[3]
-
-
-def _are_in_line(*points: Point) -> bool:
-    return any(len(set(along)) == 1 for along in zip(*points, strict=True))
 
 
 def _curves(spline: Sequence[Point]) -> list[tuple[str, str]]:

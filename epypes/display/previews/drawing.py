@@ -160,6 +160,13 @@ def _some_points(points: Any, most: Most, total: int | None = None, extents: Flo
     return Marks(kept[is_drawn], total=total, extents=None if extents is None else extents[chosen][is_drawn])
 
 
+def no_marks() -> Marks:
+    """Return what is drawn where nothing was found."""
+    import numpy as np
+
+    return Marks(np.empty((0, 2)))
+
+
 def _some_pairs(places: Any, most: Most) -> Floats:
     """Return pairs (n, 4) of places as they are drawn: of many some, none that is not finite or far away."""
     import numpy as np

@@ -144,19 +144,14 @@ def fields_of(value: Any) -> dict[str, Any] | None:
         return dict(zip(names, items_in(value), strict=False)) if type(names) is tuple else None
     if declared(kind, "__repr__") is SimpleNamespace.__repr__:
         return dict(_ATTRIBUTES.__get__(value))
-    if not _is_written_by_fields(kind):
+    # Those that Python writes: a repr of the author's own may be to hide something. It is recognized as pprint does it.
+    made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
+    if type(declared(kind, "__dataclass_fields__")) is not dict or type(made) is not FunctionType:
+        return None
+    if "__create_fn__" not in made.__qualname__:
         return None
     fields = ((field.name, stored(value, field.name)) for field in dataclasses.fields(kind) if field.repr)
     return {name: found[0] for name, found in fields if found}
-
-
-def _is_written_by_fields(kind: type) -> bool:
-    """Whether a class has the repr that ``dataclass`` makes: one of its author's own may be to hide something."""
-    if type(declared(kind, "__dataclass_fields__")) is not dict:
-        return False
-    # The function that dataclass makes is recognized as pprint does it.
-    made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
-    return type(made) is FunctionType and "__create_fn__" in made.__qualname__
 
 
 def silent_numpy() -> AbstractContextManager[Any]:

@@ -15,9 +15,9 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
-from epypes.display.previews import Backdrop, Look, Marks, Most, Scene, Surroundings
+from epypes.display.previews import Backdrop, Look, Most, Scene, Surroundings
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.drawing import are_keypoints
+from epypes.display.previews.drawing import are_keypoints, no_marks
 from epypes.display.previews.images import Range, display_range, image_kind, is_image, own_range, sampled
 from epypes.display.previews.introspection import kind_name
 from epypes.display.previews.preview import scene_in, sketch
@@ -219,12 +219,6 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
         return Scene(Backdrop(array, order, around.range_of(array), token))
     scene = scene_in(sketch(value, Look(order, around, most or Most())))
     if scene is None:
-        return _without_marks(around) if had_marks else None
+        backdrop = around.nearest_image() if had_marks else None
+        return None if backdrop is None else Scene(backdrop, no_marks())
     return scene if scene.backdrop.name else replace(scene, backdrop=replace(scene.backdrop, name=token))
-
-
-def _without_marks(around: RunSurroundings) -> Scene | None:
-    import numpy as np
-
-    backdrop = around.nearest_image()
-    return None if backdrop is None else Scene(backdrop, Marks(np.empty((0, 2))))

@@ -161,8 +161,11 @@ def token_views(
     tuple
         The tokens, and how many thumbnails were left out.
     """
-    values = {**_computed(run), **hparams.values}
-    kept = {} if run is None else _kept.setdefault(run.tokens.program, {})
+    values, kept = dict(hparams.values), _Kept()
+    if run is not None:
+        kept = _kept.setdefault(run.tokens.program, kept)
+        pairs = zip(run.tokens.program.tokens, run.tokens.values, strict=True)
+        values = {name: value for name, value in pairs if value is not NOT_COMPUTED} | values
     found: dict[str, _Found] = {}
     for token in structure.tokens:
         if (name := token.name) in values:
@@ -181,13 +184,6 @@ def token_views(
         return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""), by, before)
 
     return tuple(map(view, structure.tokens)), dropped
-
-
-def _computed(run: Run | None) -> dict[str, Any]:
-    if run is None:
-        return {}
-    pairs = zip(run.tokens.program.tokens, run.tokens.values, strict=True)
-    return {name: value for name, value in pairs if value is not NOT_COMPUTED}
 
 
 def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]) -> Rank:
