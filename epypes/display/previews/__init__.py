@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from epypes.display.previews.images import Range, display_range
 from epypes.images import Order
+from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
     Array = npt.NDArray[Any]
     Floats = npt.NDArray[np.float64]
+else:
+    np = LazyModule("numpy")
 
 THUMBNAIL_PX: Final = 128
 THUMBNAIL_BYTES: Final = 5_000
@@ -159,8 +162,6 @@ class Marks:
     @property
     def places(self) -> Floats:
         """All places that are drawn, (n, 2)."""
-        import numpy as np
-
         return np.concatenate(self.lines) if self.lines else self.points
 
 

@@ -23,10 +23,14 @@ from epypes.display.previews.introspection import is_of
 from epypes.display.previews.objects import record_sketch
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
 from epypes.display.text import cut
+from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
-    from epypes.display.previews import Array
+    import numpy as np
 
+    from epypes.display.previews import Array
+else:
+    np = LazyModule("numpy")
 
 _MOST_ELONGATED: Final = 6
 _SMALL_SIDE: Final = 4
@@ -48,8 +52,6 @@ def number_preview(number: Any, look: Look) -> Preview:
 
 def plain_array(array: Any) -> Array:
     """Return an array without what a subclass of numpy's makes of it."""
-    import numpy as np
-
     return np.asarray(array)
 
 

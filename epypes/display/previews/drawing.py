@@ -13,19 +13,21 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews import THUMBNAIL_PX, Backdrop, Chart, Look, Marks, Most, Picture, Preview, Scene, Sketch
-from epypes.display.previews.encoding import encode_image, encode_small, pillow, pillow_image
+from epypes.display.previews.encoding import encode_image, encode_small, pillow_image
 from epypes.display.previews.images import image_kind, sampled, some_of
 from epypes.display.previews.introspection import dotted_name, is_of
 from epypes.display.previews.short import array_text
 from epypes.display.text import cut
-from epypes.optional import optional_import
+from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
-    from PIL import Image
+    from PIL import Image, ImageDraw
 
     from epypes.display.previews import Floats
+else:
+    np, Image, ImageDraw = LazyModule("numpy"), LazyModule("PIL.Image"), LazyModule("PIL.ImageDraw")
 
 # -- charts -----------------------------------------------------------------------------------------------------------
 
@@ -38,8 +40,6 @@ _ASPECT: Final = 4 / 3
 
 def line_chart(values: Any) -> Chart:
     """Draw a signal; of a long one the least and the largest value of each part, so that no peak is lost."""
-    import numpy as np
-
     signal = _finite_or_nan(values)
     if signal.size > MOST_POINTS:
         parts = np.array_split(signal, _BINS)
@@ -51,8 +51,6 @@ def line_chart(values: Any) -> Chart:
 
 def bar_chart(counts: Any) -> Chart:
     """Draw a histogram; of many bins several are added up to one bar."""
-    import numpy as np
-
     bars = np.nan_to_num(_finite_or_nan(counts), nan=0.0)
     if bars.size > _BINS:
         bars = np.array([part.sum() for part in np.array_split(bars, _BINS)])
@@ -63,8 +61,6 @@ def bar_chart(counts: Any) -> Chart:
 
 def _place_chart(marks: Marks) -> Chart:
     """Draw marks without their image: in their own extent, both axes alike, y downwards."""
-    import numpy as np
-
     points = marks.points[_spread(len(marks.points), MOST_POINTS)]
     series = _shortened(marks.lines) if marks.lines else (points,)
     every = np.concatenate([*series, np.empty((0, 2))])
@@ -83,8 +79,6 @@ def _place_chart(marks: Marks) -> Chart:
 
 def _spread(count: int, most: int) -> npt.NDArray[np.intp]:
     """Return the indices of some of so many, from the first to the last."""
-    import numpy as np
-
     return np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.intp)
 
 
@@ -97,15 +91,11 @@ def _shortened(lines: tuple[Floats, ...]) -> tuple[Floats, ...]:
 
 def _finite_or_nan(values: Any) -> Floats:
     """Return values as floats; of very many every n-th."""
-    import numpy as np
-
     flat = some_of(values).reshape(-1).astype(np.float64)
     return np.where(np.isfinite(flat), flat, np.nan)
 
 
 def _ends(part: Floats) -> tuple[float, float]:
-    import numpy as np
-
     finite = part[np.isfinite(part)]
     if not finite.size:
         return np.nan, np.nan
@@ -116,8 +106,6 @@ def _ends(part: Floats) -> tuple[float, float]:
 
 def _scaled(values: Floats) -> Floats:
     """Return values between 0 and 1; of a constant, the middle."""
-    import numpy as np
-
     if not values.size:
         return values
     low, high = values.min() / 2, values.max() / 2
@@ -151,8 +139,6 @@ _COLOURS: Final = ((255, 90, 90), (90, 220, 255), (255, 215, 70), (120, 255, 130
 
 def _some_points(points: Any, most: Most, total: int | None = None, extents: Floats | None = None) -> Marks:
     """Return points as marks: of many some, evenly spread in their order, none that is not finite."""
-    import numpy as np
-
     total = len(points) if total is None else total
     chosen = _spread(len(points), most.marks)
     kept = points[chosen].reshape(-1, 2).astype(np.float64)
@@ -162,23 +148,17 @@ def _some_points(points: Any, most: Most, total: int | None = None, extents: Flo
 
 def no_marks() -> Marks:
     """Return what is drawn where nothing was found."""
-    import numpy as np
-
     return Marks(np.empty((0, 2)))
 
 
 def _some_pairs(places: Any, most: Most) -> Floats:
     """Return pairs (n, 4) of places as they are drawn: of many some, none that is not finite or far away."""
-    import numpy as np
-
     kept: Floats = places[_spread(len(places), most.pairs)].astype(np.float64)
     return kept[_is_drawable(kept)]
 
 
 def _some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = None) -> Marks:
     """Return lines, each (k, 2), as marks: of many the longest, each with at most so many points."""
-    import numpy as np
-
     longest = sorted(lines, key=len, reverse=True)[: most.marks] if len(lines) > most.marks else lines
     room = min(most.line, _share([len(line) for line in longest], most.places))
     kept = [line[:: -(-len(line) // room) or 1].reshape(-1, 2) for line in longest if len(line)]
@@ -188,8 +168,6 @@ def _some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = No
 
 def _drawable_lines(lines: list[Any]) -> list[Floats]:
     """Return the lines without what can't be drawn of them; looked at together, since there may be thousands."""
-    import numpy as np
-
     if not lines:
         return []
     places, ends = np.concatenate(lines).astype(np.float64), np.cumsum(list(map(len, lines)))[:-1]
@@ -234,8 +212,6 @@ def scene_picture(scene: Scene, max_side_px: int, most_bytes: int) -> Picture:
 
 def _pair_scene(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, what: str) -> Scene:
     """Return two images side by side, at their full size, with lines; ``pairs`` are (n, 4): x and y in both."""
-    import numpy as np
-
     left, right = (np.asarray(_picture(backdrop, None)) for backdrop in backdrops)
     height, width = max(len(left), len(right)), left.shape[1]
     joined = np.zeros((height, width + right.shape[1], 3), np.uint8)
@@ -247,8 +223,6 @@ def _pair_scene(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int,
 
 
 def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
-    import numpy as np
-
     return np.asarray((np.abs(np.nan_to_num(places, nan=np.inf)) < _FARTHEST_PX).all(axis=1))
 
 
@@ -264,11 +238,9 @@ def _drawn_over(backdrop: Backdrop, marks: Marks, side: int = THUMBNAIL_PX) -> I
 
 
 def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image.Image:
-    import numpy as np
-
     side = THUMBNAIL_PX * _OVERSAMPLED // 2
     (left, left_scale), (right, right_scale) = (_canvas(backdrop, side) for backdrop in backdrops)
-    canvas: Image.Image = pillow().new("RGB", (2 * side, max(left.height, right.height)))
+    canvas = Image.new("RGB", (2 * side, max(left.height, right.height)))
     canvas.paste(left, (side - left.width, 0))
     canvas.paste(right, (side, 0))
     pen = _Pen(canvas)
@@ -288,7 +260,7 @@ def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     scale = side / max(array.shape[:2])
     # Even sides, so that each pixel of the thumbnail is made of four.
     height, width = (max(1, round(length * scale / _OVERSAMPLED)) * _OVERSAMPLED for length in array.shape[:2])
-    picture = picture.resize((width, height), pillow().Resampling.BILINEAR)
+    picture = picture.resize((width, height), Image.Resampling.BILINEAR)
     return picture.point(lambda level: round(level * _DARKER)), scale
 
 
@@ -301,9 +273,6 @@ class _Pen:
     """Draws upon a canvas, and nothing that is far off: Pillow would visit each pixel of a line, wherever it is."""
 
     def __init__(self, canvas: Image.Image) -> None:
-        with optional_import():
-            from PIL import ImageDraw
-
         self._draw = ImageDraw.Draw(canvas)
         self._low = -_MARGIN * canvas.width, -_MARGIN * canvas.height
         self._high = (1 + _MARGIN) * canvas.width, (1 + _MARGIN) * canvas.height
@@ -388,8 +357,6 @@ def _segments(array: Any, most: Most) -> Marks:
 
 def _rectangles(boxes: Any, most: Most) -> Marks:
     """Return boxes (n, 4) of x, y, width and height as marks."""
-    import numpy as np
-
     x, y, width, height = boxes[: most.marks].astype(np.float64).T
     corners = np.stack([x, y, x + width, y, x + width, y + height, x, y + height], axis=1)
     return replace(_some_lines(list(corners.reshape(-1, 4, 2)), True, most), total=len(boxes))
@@ -430,8 +397,6 @@ def _pair_sketch(array: Any, look: Look) -> Sketch | None:
 
 def _extent(points: Any) -> str:
     """Return where points lie; of very many, where some of them do."""
-    import numpy as np
-
     some = points[:: -(-len(points) // _WEIGHED) or 1].reshape(-1, 2).astype(np.float64)
     some = some[np.isfinite(some).all(axis=1)]
     if not len(some):
@@ -541,8 +506,6 @@ def _has_contour_shape(array: Any) -> bool:
 
 
 def _keypoints(value: Sequence[Any], shown: Preview, look: Look) -> Sketch:
-    import numpy as np
-
     weighed = sorted(value[:_WEIGHED], key=lambda keypoint: -keypoint.response)[: look.most.marks]
     extents = np.array([(keypoint.size, keypoint.angle) for keypoint in weighed], dtype=np.float64)
     points = np.array([keypoint.pt for keypoint in weighed], dtype=np.float64)
@@ -552,8 +515,6 @@ def _keypoints(value: Sequence[Any], shown: Preview, look: Look) -> Sketch:
 
 
 def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
-    import numpy as np
-
     known = value[:_WEIGHED]
     flat = known if _is_match(value[0]) else [item[0] for item in known if len(item)]
     if not _is_match(flat[0]) or not _are_of_one_class(flat):

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import PurePath
 from types import MappingProxyType
-from typing import Any, Final, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews import (
@@ -30,7 +30,7 @@ from epypes.display.previews import (
     objects,
 )
 from epypes.display.previews.drawing import MOST_LINES, MOST_POINTS
-from epypes.display.previews.encoding import encode_small, pillow
+from epypes.display.previews.encoding import encode_small
 from epypes.display.previews.images import is_image
 from epypes.display.previews.introspection import (
     dotted_name,
@@ -45,7 +45,13 @@ from epypes.display.previews.short import reason
 from epypes.display.text import cut
 from epypes.images import Order
 from epypes.nothing import NothingType
+from epypes.optional import LazyModule
 from epypes.run.guard import lend_to_reader
+
+if TYPE_CHECKING:
+    from PIL import Image
+else:
+    Image = LazyModule("PIL.Image")
 
 _TEXT_CHARACTERS: Final = 30
 _DETAIL_CHARACTERS: Final = 290
@@ -301,7 +307,7 @@ def _checked_chart(chart: Any) -> Chart:
 
 def _checked_picture(picture: Picture, most_bytes: int) -> Picture:
     """Return a picture within the limits of a thumbnail; what it is, its bytes decide."""
-    with pillow().open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
+    with Image.open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
         if opened.width * opened.height > _MOST_PIXELS:
             raise ValueError(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
         # What is broken is found by decoding it.

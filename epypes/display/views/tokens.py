@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 from epypes.display.previews import THUMBNAIL_BYTES, Look, Preview, Sketch
@@ -14,6 +14,7 @@ from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.views.graphview import GraphView, TokenState, TokenView
 from epypes.display.views.surroundings import RunSurroundings
 from epypes.nothing import NothingType
+from epypes.optional import LazyModule
 from epypes.run import Run
 from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, is_same_value
@@ -22,6 +23,12 @@ from epypes.run.staleness import NOT_COMPUTED, is_same_value
 _LEAST_BYTES: Final = 1_500
 _ELEMENT_CHARACTERS: Final = 150
 _POINT_CHARACTERS: Final = 12
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+    np = LazyModule("numpy")
+
 
 _SCALARS: Final = frozenset({int, float, complex, bool, type(None), NothingType})
 _SHORT_TEXT: Final = 200
@@ -89,8 +96,6 @@ class _TokenPreview:
 
 def _is_locked(array: Any) -> bool:
     """Whether no part of an array can be written, through whatever array that has its memory."""
-    import numpy as np
-
     while type(array) is np.ndarray:
         if array.flags.writeable:
             return False
