@@ -16,10 +16,16 @@ from typing import TYPE_CHECKING, Any, Final
 from xml.etree import ElementTree
 
 from epypes.display.paint.style import paper_declarations
-from epypes.optional import optional_import
+from epypes.optional import LazyModule, optional_import
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib import axes, figure, font_manager, patches, path, textpath
+    from PIL import Image
+else:
+    figure, font_manager, patches, path, textpath = (
+        LazyModule(f"matplotlib.{name}") for name in ("figure", "font_manager", "patches", "path", "textpath")
+    )
+    Image = LazyModule("PIL.Image")
 
 # Pixels of SVG per inch of paper; then a line of 1 px is a line of 1 pt.
 _PX_PER_INCH: Final = 72
@@ -38,7 +44,7 @@ Point = tuple[float, float]
 Style = Mapping[str, str]
 
 
-def save_on_paper(svg: str, path: Path) -> None:
+def save_on_paper(svg: str, file: Path) -> None:
     """Write a painted graph as PNG or PDF, by the ending of the path, on white.
 
     Raises
@@ -48,30 +54,29 @@ def save_on_paper(svg: str, path: Path) -> None:
     """
     with optional_import():
         import matplotlib as mpl
-        from matplotlib.figure import Figure
 
     root = ElementTree.fromstring(svg)  # noqa: S314 - our own text
     left, top, width, height = map(float, root.attrib["viewBox"].split())
-    kind = path.suffix[1:]
+    kind = file.suffix[1:]
     scale = min(_PNG_SCALE, _MOST_PNG_PX / max(width, height)) if kind == "png" else 1.0
     # Without times and versions, so that the same picture is the same file.
     metadata = {"Software": None} if kind == "png" else {"CreationDate": None, "Producer": None}
     with mpl.rc_context(_PLAIN), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure = Figure(figsize=(width / _PX_PER_INCH, height / _PX_PER_INCH), facecolor="white")
-        axes = figure.add_axes((0, 0, 1, 1))
-        axes.set_axis_off()
-        axes.set_xlim(left, left + width)
-        axes.set_ylim(top + height, top)
-        _Painter(axes).paint(root)
-        figure.savefig(path, format=kind, dpi=_PX_PER_INCH * scale, metadata=metadata)
+        page = figure.Figure(figsize=(width / _PX_PER_INCH, height / _PX_PER_INCH), facecolor="white")
+        drawn = page.add_axes((0, 0, 1, 1))
+        drawn.set_axis_off()
+        drawn.set_xlim(left, left + width)
+        drawn.set_ylim(top + height, top)
+        _Painter(drawn).paint(root)
+        page.savefig(file, format=kind, dpi=_PX_PER_INCH * scale, metadata=metadata)
 
 
 class _Painter:
     """Draws the elements of an SVG into axes, one above the other."""
 
-    def __init__(self, axes: Axes) -> None:
-        self._axes = axes
+    def __init__(self, drawn: axes.Axes) -> None:
+        self._axes = drawn
         self._above = 0
         self._draw = {
             "rect": self._rectangle,
@@ -120,51 +125,40 @@ class _Painter:
         self._axes.add_artist(patch)
 
     def _rectangle(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import FancyBboxPatch
-
         x, y, width, height = (_number(element, name) for name in ("x", "y", "width", "height"))
         radius = min(_number(element, "rx"), width / 2, height / 2)
         corners = f"round,pad=0,rounding_size={radius:.3f}" if radius else "square,pad=0"
-        self._add(FancyBboxPatch((x, y), width, height, boxstyle=corners), style)
+        self._add(patches.FancyBboxPatch((x, y), width, height, boxstyle=corners), style)
 
     def _ellipse(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import Ellipse
-
         across, down = (_number(element, name) or _number(element, "r") for name in ("rx", "ry"))
-        self._add(Ellipse((_number(element, "cx"), _number(element, "cy")), 2 * across, 2 * down), style)
+        self._add(patches.Ellipse((_number(element, "cx"), _number(element, "cy")), 2 * across, 2 * down), style)
 
     def _polygon(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import Polygon
-
-        numbers = [float(number) for number in re.findall(_NUMBER, element.attrib["points"])]
-        points = list(zip(numbers[::2], numbers[1::2], strict=True))
-        if points:
-            self._add(Polygon(points, closed=element.tag.endswith("polygon")), style)
+        end = "Z" if element.tag.endswith("polygon") else ""
+        self._add_path(f"M{element.attrib['points'].replace(' ', 'L')}{end}", style)
 
     def _path(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import PathPatch
-        from matplotlib.path import Path as Curve
+        self._add_path(element.attrib["d"], style)
 
-        steps = [*_steps(element.attrib["d"])]
+    def _add_path(self, written: str, style: Style) -> None:
+        steps = [*_steps(written)]
         if steps:
             points, codes = zip(*steps, strict=True)
-            self._add(PathPatch(Curve(points, codes)), style)
+            self._add(patches.PathPatch(path.Path(points, codes)), style)
 
     def _text(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.font_manager import FontProperties
-        from matplotlib.textpath import TextPath
-
         text = "".join(element.itertext())
         if not text.strip():
             return
         is_row = "monospace" in style.get("font", "")
         size = float(style.get("font-size", "10px" if is_row else "12px").removesuffix("px"))
-        font = FontProperties(
+        font = font_manager.FontProperties(
             family="DejaVu Sans Mono" if is_row else "DejaVu Sans",
             weight="bold" if int(style.get("font-weight", 400)) >= 600 else "normal",
         )
         # These letters are wider than those of most screens.
-        written = TextPath((0, 0), text.replace("$", "S"), size, prop=font).get_extents().width or 1.0
+        written = textpath.TextPath((0, 0), text.replace("$", "S"), size, prop=font).get_extents().width or 1.0
         room = len(text) * _CHARACTER_PX * size / 12 + _BESIDE_PX
         self._axes.text(
             _number(element, "x"),
@@ -180,18 +174,14 @@ class _Painter:
         )
 
     def _image(self, element: ElementTree.Element, style: Style) -> None:
-        with optional_import():
-            from PIL import Image, UnidentifiedImageError
-        from matplotlib.patches import Rectangle
-
         x, y, width, height = (_number(element, name) for name in ("x", "y", "width", "height"))
         data = base64.b64decode(element.attrib["href"].partition(",")[2])
         try:
             with Image.open(io.BytesIO(data)) as picture:
                 pixels = picture.convert("RGBA")
-        except UnidentifiedImageError:
+        except OSError:
             # What a preview of a user's own gives may be a drawing.
-            self._add(Rectangle((x, y), width, height), {"fill": "#e6e8eb"})
+            self._add(patches.Rectangle((x, y), width, height), {"fill": "#e6e8eb"})
             return
         opacity = float(style.get("opacity", 1))
         shown = self._axes.imshow(
