@@ -66,7 +66,8 @@ def shortened(text: str, characters: int) -> str:
 
 def cut(text: str, characters: int) -> str:
     """Return text on one line, of at most so many characters."""
-    return shortened(" ".join(text.split()), characters)
+    text = " ".join(text.split())
+    return text if len(text) <= characters else shortened(text, characters)
 
 
 def listed(names: Sequence[str], most: int) -> str:

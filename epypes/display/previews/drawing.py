@@ -16,7 +16,7 @@ from epypes.display.previews import THUMBNAIL_PX, Backdrop, Chart, Look, Marks, 
 from epypes.display.previews.encoding import encode_image, encode_small, pillow_image
 from epypes.display.previews.images import image_kind, sampled, some_of
 from epypes.display.previews.introspection import dotted_name, is_of
-from epypes.display.previews.short import array_text
+from epypes.display.previews.short import array_text, row_texts
 from epypes.display.text import cut
 from epypes.optional import LazyModule
 
@@ -319,6 +319,7 @@ class _Pen:
 _LOOKED_AT: Final = 100
 _WEIGHED: Final = 10_000
 _NAME_CHARACTERS: Final = 40
+_MOST_ROWS: Final = 4
 
 # -- arrays of places ----------------------------------------------------------------------------------------------
 
@@ -528,9 +529,8 @@ def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
         pairs = _some_pairs(np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept]), look.most)
         if len(pairs):
             return _between(backdrops, pairs, len(value), Preview(shown.text, detail), "matches")
-    rows = [f"{m.queryIdx} - {m.trainIdx}: {m.distance:.4g}" for m in flat[:3]]
-    rows += [f"... {len(value) - 3} more"] * (len(value) > 3)
-    return Sketch(Preview(shown.text, detail, rows=tuple(rows)))
+    rows = (f"{match.queryIdx} - {match.trainIdx}: {match.distance:.4g}" for match in flat)
+    return Sketch(Preview(shown.text, detail, rows=row_texts(rows, len(value), _MOST_ROWS)))
 
 
 def _indices_fit(matches: Sequence[Any], first: Sequence[Any], second: Sequence[Any]) -> bool:

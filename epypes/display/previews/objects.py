@@ -160,11 +160,10 @@ def frame_preview(frame: Any, look: Look) -> Preview:
 
 def series_preview(series: Any, look: Look) -> Preview:
     """Look at a column of pandas."""
-    rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
+    rows = (f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_MOST_ROWS].items())
     name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
-    more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
     detail = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
-    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=(*rows, *more))
+    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=row_texts(rows, len(series), _MOST_ROWS))
 
 
 def record_sketch(array: Any) -> Preview:
