@@ -13,7 +13,7 @@ from epypes.display.paint.page import paint_figure, paint_graph, paint_page
 from epypes.display.paint.paper import save_on_paper
 from epypes.display.paint.svg import alt_text, paint_svg
 from epypes.display.paint.tables import Tabular, paint_table, paint_text, repr_text, summary_of, table_of, text_table
-from epypes.display.paint.times import paint_bars, report_times, summary_times, times_alt_text
+from epypes.display.paint.times import paint_bars, times_alt_text, times_of
 from epypes.display.previews.short import reason
 from epypes.display.text import MOST_THUMBNAILS, escape, size
 from epypes.display.views.graphview import GraphView, to_json
@@ -70,7 +70,7 @@ def _forms(shown: Any) -> Forms:
         return {"text/html": f"<p>{shown}</p>"}
     if not isinstance(shown, RunReport | TimingSummary):
         return _graph_forms(view(shown), _table_below(shown))
-    times = report_times(shown) if isinstance(shown, RunReport) else summary_times(shown)
+    times = times_of(shown)
     svg = paint_bars(times)
     figure = paint_figure(svg, times_alt_text(times), times.legend)
     return {"text/html": paint_page(figure, paint_table(table_of(shown))), "image/svg+xml": svg}

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from epypes.display.paint.times import TimesView, report_times, summary_times
+from epypes.display.paint.times import times_of
 from epypes.display.paint.vertices import stage_words
 from epypes.display.previews.short import reason
 from epypes.display.text import content, cut, cut_name, duration_text, fitted, size
@@ -45,13 +45,12 @@ def table_of(shown: Tabular) -> Table:
     """
     if isinstance(shown, Plan):
         return _plan_table(plan_view(shown))
-    if isinstance(shown, RunReport):
-        return _times_table(report_times(shown, _MOST_FUNCTIONS), ("function", "time", "share"))
-    summary = shown if isinstance(shown, TimingSummary) else summary_of(shown)
-    if isinstance(summary, str):
-        return Table(summary, (), ())
-    head = "function", "runs", "mode", "median", "5 % to 95 %"
-    return _times_table(summary_times(summary, _MOST_FUNCTIONS), head)
+    if isinstance(shown, Reports):
+        summary = summary_of(shown)
+        return Table(summary, (), ()) if isinstance(summary, str) else table_of(summary)
+    times = times_of(shown, _MOST_FUNCTIONS)
+    *bars, overhead, total = times.bars
+    return Table(times.caption, times.head, [(bar.name, *bar.cells) for bar in (*bars, total, overhead)])
 
 
 def summary_of(reports: Reports) -> TimingSummary | str:
@@ -63,11 +62,6 @@ def summary_of(reports: Reports) -> TimingSummary | str:
         return summarize(given)
     except ValueError as error:  # all runs have failed
         return str(error)
-
-
-def _times_table(times: TimesView, head: tuple[str, ...]) -> Table:
-    *bars, overhead, total = times.bars
-    return Table(times.caption, head, [(bar.name, *bar.cells) for bar in (*bars, total, overhead)])
 
 
 def _plan_table(graph: GraphView) -> Table:

@@ -55,11 +55,25 @@ class TimeBar(NamedTuple):
 
 
 class TimesView(NamedTuple):
-    """What is to be seen of times: bars in run order, then graph overhead and total; ``legend`` explains the bars."""
+    """What is to be seen of times: bars in run order, then graph overhead and total.
+
+    Attributes
+    ----------
+    legend
+        Explains the bars.
+    head
+        What stands above the names and cells in a table.
+    """
 
     caption: str
     legend: str
+    head: tuple[str, ...]
     bars: tuple[TimeBar, ...]
+
+
+def times_of(shown: RunReport | TimingSummary, most: int = MOST_BARS) -> TimesView:
+    """Look at the times of a run, or of many; of many functions at those that take longest."""
+    return report_times(shown, most) if isinstance(shown, RunReport) else summary_times(shown, most)
 
 
 def _named(kind: BarKind, name: str) -> str:
@@ -91,6 +105,7 @@ def report_times(report: RunReport, most: int = MOST_BARS) -> TimesView:
     return TimesView(
         caption,
         _REPORT_LEGEND,
+        ("function", "time", "share"),
         (
             *(bar._replace(length=bar.length / scale) for bar in bars),
             TimeBar("total", "in all", total, f"in all: {total}", (total, "")),
@@ -137,7 +152,7 @@ def summary_times(summary: TimingSummary, most: int = MOST_BARS) -> TimesView:
     bars.append(_fitted_bar("total", "in all", summary.total, scale)._replace(length=0.0, low=0.0, high=0.0))
     left_out = f", {counted(summary.failed_runs, 'failed run')} left out" * bool(summary.failed_runs)
     caption = f"{counted(summary.runs, 'run')}{left_out}; log-normal distributions"
-    return TimesView(caption, _SUMMARY_LEGEND, tuple(bars))
+    return TimesView(caption, _SUMMARY_LEGEND, ("function", "runs", "mode", "median", "5 % to 95 %"), tuple(bars))
 
 
 def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) -> TimeBar:

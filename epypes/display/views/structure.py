@@ -107,7 +107,7 @@ class _Structure:
         return f"{selector} = {cut(key if isinstance(key, str) else preview(key).text, _KEY_CHARACTERS)}"
 
     def _token(self, token: str) -> TokenView:
-        maker, takers = self._cg.digraph.producer.get(token), self._cg.digraph.consumers[token]
+        maker, takers = self._cg.digraph.producer.get(token), self._cg.digraph.consumers.get(token, ())
         if maker is not None:
             is_left_out = maker in self._left_out
         else:
