@@ -89,10 +89,10 @@ class _Painter:
             "image": self._image,
         }
 
-    def paint(self, element: ElementTree.Element, around: tuple[tuple[str, frozenset[str]], ...] = ()) -> None:
+    def paint(self, element: ElementTree.Element, around: tuple[set[str], ...] = ()) -> None:
         """Draw an element and all in it; ``around`` are tag and classes of those that it is in."""
         tag = element.tag.rpartition("}")[2]
-        own = tag, frozenset(element.get("class", "").split())
+        own = {tag, *(f".{name}" for name in element.get("class", "").split())}
         draw = self._draw.get(tag)
         if draw is not None:
             written = dict(part.split(":", 1) for part in element.get("style", "").split(";") if part)
