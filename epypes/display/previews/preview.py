@@ -274,10 +274,10 @@ def _trimmed(shown: Preview) -> Preview:
         if not issubclass(type(line), str):
             raise TypeError("text, detail and rows of a preview must be texts")
     text = cut(plain_text(shown.text)[:500], _TEXT_CHARACTERS)
-    short = (plain_text(row)[:_ROW_CHARACTERS] for row in rows)
-    lines = tuple("".join(mark if mark.isprintable() else " " for mark in row) for row in short)
+    short = [plain_text(row)[:_ROW_CHARACTERS] for row in rows]
+    lines = ["".join(mark if mark.isprintable() else " " for mark in row) for row in short]
     detail = cut(plain_text(shown.detail)[:1000], _DETAIL_CHARACTERS)
-    return Preview(text or "(empty text)", detail, shown.picture, shown.chart, lines)
+    return Preview(text or "(empty text)", detail, shown.picture, shown.chart, tuple(lines))
 
 
 def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | None:

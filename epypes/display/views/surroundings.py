@@ -91,9 +91,11 @@ class RunSurroundings(Surroundings):
     def __init__(self, run: Run, token: str, *, keeps_ranges: bool = True) -> None:
         self._run, self._token, self._keeps_ranges = run, token, keeps_ranges
 
-    def range_of(self, image: Any) -> Range:
-        """Return which values of the token's own image are black and white."""
-        return self._range(self._token, image)
+    def range_of(self, image: Any, token: str = "") -> Range:
+        """Return which values of a token's image are black and white; without one, of this token's."""
+        if not self._keeps_ranges:
+            return display_range(image)
+        return _kept_range(self._run.tokens.program, token or self._token, image)
 
     def nearest_image(self) -> Backdrop | None:
         """Return the nearest image among the token's ancestors; of its size rather a photograph than a mask."""
@@ -112,9 +114,6 @@ class RunSurroundings(Surroundings):
         """Return the values of the two nearest keypoint tokens, one by each input in order."""
         found = self._pair(self._token, self._is_keypoints, set())
         return (self._value(found[0]), self._value(found[1])) if found is not None else None
-
-    def _range(self, token: str, image: Any) -> Range:
-        return _kept_range(self._run.tokens.program, token, image) if self._keeps_ranges else display_range(image)
 
     def _image_of(self, token: str) -> Backdrop | None:
         if not self._is_fresh(token):
@@ -178,7 +177,7 @@ class RunSurroundings(Surroundings):
 
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
-        return Backdrop(value, colour_order(self._run.cg, token), self._range(token, value), token)
+        return Backdrop(value, colour_order(self._run.cg, token), self.range_of(value, token), token)
 
 
 def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:
