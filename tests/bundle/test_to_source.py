@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import math
-import time
 
 import cv2
 import numpy as np
@@ -411,10 +410,7 @@ def test_a_chain_of_ten_thousand_functions_is_written():
     names = notebook("".join(f"def f{number}(x):\n    return x + 1\n\n\n" for number in range(100)))
     functions = {f"f{number}": names[f"f{number % 100}"] if number % 2 else math.floor for number in range(10_000)}
     cg = ep.CompGraph(functions, {f"f{number}": (f"t{number}", f"t{number + 1}") for number in range(10_000)})
-    start = time.perf_counter()
-    text = ep.to_source(cg)
-    assert time.perf_counter() - start < 20
-    assert executed(text)(0) == 5000
+    assert executed(ep.to_source(cg))(0) == 5000
 
 
 def test_long_constants_of_the_notebook_stand_as_they_were():
