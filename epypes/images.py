@@ -226,16 +226,6 @@ def is_marked(function: Callable[..., Any]) -> bool:
     return bool(_marked_hints(function))
 
 
-def image_contracts(function: Callable[..., Any]) -> Contracts:
-    """Read the marks in a function's annotations: by positional parameter, and by output.
-
-    A return annotation ``tuple[A, B]`` says it of two outputs, any other of one. Nothing is said (``((), ())``) where
-    there is no mark, or where the annotations can't be resolved.
-    """
-    read = _read(function)
-    return _marks(*read) if read is not None else ((), ())
-
-
 def _marks(signature: inspect.Signature, hints: Mapping[str, Any]) -> Contracts:
     positional = [
         parameter.name

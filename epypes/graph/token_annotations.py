@@ -23,22 +23,6 @@ def annotated_params(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
             yield found
 
 
-def image_hint(cg: CompGraph, token: str) -> Image | None:
-    """Return the mark of a token as an image, None without any.
-
-    It is the mark on the output of the function that makes it, else the first one with an order on an input of those
-    that take it.
-    """
-    cg.require_token(token)
-    made = None
-    for _, name, mark, verb in marks_of(cg.contracts, cg.digraph):
-        if name == token and mark.order is not None:
-            return mark
-        if name == token and verb == "makes":
-            made = mark
-    return made
-
-
 def read_contracts(functions: Mapping[str, Callable[..., Any]], digraph: BipartiteDigraph) -> dict[str, Contracts]:
     """Return the marks of images in the annotations of functions, by name; functions without any are left out."""
     marked = {key for key, function in distinct(functions).items() if is_marked(function)}
