@@ -211,6 +211,11 @@ def swapped(image: Any) -> Any:
     return copy
 
 
+def in_order(image: Any, order: Order) -> Any:
+    """Return an image of OpenCV's, which is BGR, in an order; it is copied only if it has to be changed."""
+    return swapped(image) if order == "rgb" and has_colours(image) else image
+
+
 # By input and by output token of a function, the mark of an image or None.
 Contracts = tuple[tuple[Image | None, ...], tuple[Image | None, ...]]
 
