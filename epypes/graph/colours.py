@@ -7,7 +7,7 @@ a blur does, has the order on both sides of the function. Only what is sure coun
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +21,7 @@ from epypes.images import Contracts, Order
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
-    from epypes.graph.validation import Delay
+    from epypes.graph.validation import GraphParts
 
 _MARK: Final = "Annotated[np.ndarray, ep.Image(order={!r})]."
 
@@ -78,28 +78,23 @@ def colour_order(cg: CompGraph, token: str) -> Order:
 
 
 def find_orders(
-    functions: Mapping[str, Callable[..., Any]],
-    digraph: BipartiteDigraph,
-    func_io: Mapping[str, Any],
-    contracts: Mapping[str, Contracts],
-    delays: Mapping[str, Delay],
+    parts: GraphParts, digraph: BipartiteDigraph, contracts: Mapping[str, Contracts]
 ) -> tuple[dict[str, ColourOrder], list[Finding]]:
     """Find the orders of colours of tokens, and the tokens that two functions surely want in different ones.
 
     Parameters
     ----------
-    functions
-        The callables by name.
-    digraph, func_io
-        What ``read_io`` returns.
+    parts
+        The graph's parts.
+    digraph
+        What is connected to what.
     contracts
         The marks of images in annotations, by function.
-    delays
-        By token, the token whose previous value it has.
     """
-    search = _Search(functions, digraph, func_io, contracts, delays)
+    search = _Search(parts, digraph, contracts)
+    functions = parts.functions
     # A large graph has few functions under many names.
-    telling = {key for key, function in distinct(functions).items() if may_tell(function) or inner_graph(function)}
+    telling = {key for key, function in distinct(functions).items() if _is_telling(function)}
     names = [name for name in digraph.inputs if id(functions.get(name)) in telling]
     search.spread([*search.marked(), *search.made(names), *search.taken(names)])
     hints: dict[str, list[ColourOrder]] = {}
@@ -117,16 +112,9 @@ def find_orders(
 class _Search:
     """Carries what functions say from token to token."""
 
-    def __init__(
-        self,
-        functions: Mapping[str, Callable[..., Any]],
-        digraph: BipartiteDigraph,
-        func_io: Mapping[str, Any],
-        contracts: Mapping[str, Contracts],
-        delays: Mapping[str, Delay],
-    ) -> None:
-        self._functions, self._digraph, self._func_io, self._contracts = functions, digraph, func_io, contracts
-        self._delayed = [(previous, delay.token) for previous, delay in delays.items()]
+    def __init__(self, parts: GraphParts, digraph: BipartiteDigraph, contracts: Mapping[str, Contracts]) -> None:
+        self._parts, self._digraph, self._contracts = parts, digraph, contracts
+        self._delayed = [(previous, delay.token) for previous, delay in parts.delays.items()]
         self._uses: dict[tuple[int, int], ColourUse] = {}
         self._disagreeing: set[tuple[str, ...]] = set()
         self.orders: dict[str, ColourOrder] = {}
@@ -155,7 +143,7 @@ class _Search:
                     yield token, ColourOrder(order, name, "takes", token, is_sure=is_sure)
 
     def _use(self, name: str) -> ColourUse:
-        function, count = self._functions.get(name), len(self._digraph.inputs[name])
+        function, count = self._parts.functions.get(name), len(self._digraph.inputs[name])
         key = id(function), count
         if key not in self._uses:
             inner = inner_graph(function)
@@ -165,7 +153,7 @@ class _Search:
     def _outputs(self, name: str) -> Iterator[tuple[str, TracedImage]]:
         """Give the images that a function makes or passes on, but for those of which a mark says the order."""
         tokens, returned = self._digraph.outputs[name], self._use(name).returned
-        if name in self._func_io and isinstance(self._func_io[name][1], str):
+        if self._parts.has_single_output(name):
             returned = (returned,)
         if isinstance(returned, tuple) and len(returned) == len(tokens):
             for place, (token, image) in enumerate(zip(tokens, returned, strict=True)):
@@ -210,6 +198,10 @@ class _Search:
                     taken = inputs[image.place]
                     if made != taken and token in (made, taken):
                         yield taken if token == made else made, image.is_swapped
+
+
+def _is_telling(function: object) -> bool:
+    return may_tell(function) or inner_graph(function) is not None
 
 
 def _use_of_pipeline(function: Any, inner: CompGraph) -> ColourUse:

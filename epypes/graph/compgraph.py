@@ -116,10 +116,10 @@ class CompGraph(OldNames):
         findings = list(parts.findings)
         digraph, func_io = read_io(parts.func_io, findings)
         order = digraph.run_order()
-        hints = read_hints(parts.functions, digraph, func_io, parts.types)
+        hints = read_hints(parts, digraph)
         contracts = contracts_of(hints)
         findings += find_problems(parts, digraph, hints, contracts, len(order) == len(digraph.inputs))
-        colours, contradictions = find_orders(parts.functions, digraph, func_io, contracts, parts.delays)
+        colours, contradictions = find_orders(parts, digraph, contracts)
         findings += contradictions
         if findings:
             raise GraphError(findings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from types import FunctionType, MethodType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,6 +17,7 @@ from epypes.images import Contracts, Image, mark_of
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
+    from epypes.graph.validation import GraphParts
 
 
 class TokenHints(NamedTuple):
@@ -42,25 +43,23 @@ class TokenHints(NamedTuple):
     marks: Contracts | None
 
 
-def read_hints(
-    functions: Mapping[str, Callable[..., Any]], digraph: BipartiteDigraph, func_io: Mapping[str, Any], types: bool
-) -> dict[str, TokenHints]:
+def read_hints(parts: GraphParts, digraph: BipartiteDigraph) -> dict[str, TokenHints]:
     """Return the type hints of tokens by function; functions without annotations are left out.
 
-    Without ``types`` also those that have no marks of images.
+    If types are not compared, also those that have no marks of images.
     """
     annotated = {
         key
-        for key, function in distinct(functions).items()
-        if _is_annotated(function) and (types or _is_marked(function))
+        for key, function in distinct(parts.functions).items()
+        if _is_annotated(function) and (parts.types or _is_marked(function))
     }
     found: dict[str, TokenHints] = {}
     # A large graph has few functions under many names.
     read: dict[tuple[int, int, int | None], TokenHints | None] = {}
     for name, tokens in digraph.inputs.items():
-        function = functions.get(name)
+        function = parts.functions.get(name)
         if function is not None and id(function) in annotated:
-            count = None if isinstance(func_io[name][1], str) else len(digraph.outputs[name])
+            count = None if parts.has_single_output(name) else len(digraph.outputs[name])
             key = id(function), len(tokens), count
             if key not in read:
                 read[key] = _hints_of_tokens(function, len(tokens), count)

@@ -78,6 +78,10 @@ class GraphParts:
     findings: list[Finding] = field(default_factory=list)
     delays: dict[str, Delay] = field(default_factory=dict)
 
+    def has_single_output(self, name: str) -> bool:
+        """Whether a function's value is one token as it is, not a sequence of tokens."""
+        return isinstance(self.func_io[name][1], str)
+
 
 def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[BipartiteDigraph, dict[str, Any]]:
     """Read the paper's func_io; what can't be read becomes a finding and is left out.
