@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,7 @@ import click
 
 from epypes.cli.bundles import run_promotion
 from epypes.cli.options import PATH, allow_option, bundle_argument, keys_option, seconds_option
-from epypes.cli.terminal import print_table
+from epypes.cli.terminal import json_of, print_table
 from epypes.errors import ServiceError, UnknownName
 
 if TYPE_CHECKING:
@@ -29,7 +28,6 @@ _CALLS: Final = 5
 # What is read in a line: a homography, a line per lane, the bins of a small histogram.
 _MOST_NUMBERS: Final = 24
 _MOST_AXES: Final = 3
-_MOST_JSON_NUMBERS: Final = 1_000
 _EPYPES: Final = (sys.executable, "-m", "epypes.cli")
 
 _address_option: Final = functools.partial(
@@ -84,9 +82,7 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     _warn_of_assumed(settings, [*coloured, *(token for token in pictures if has_colours(answer.tokens[token]))])
     if as_json:
         shown = {token: value for token, value in answer.tokens.items() if value is not Nothing}
-        tokens = {
-            token: {"file": files[token]} if token in files else _json_of(value) for token, value in shown.items()
-        }
+        tokens = {token: {"file": files[token]} if token in files else json_of(value) for token, value in shown.items()}
         click.echo(json.dumps({**asdict(replace(answer, tokens={})), "tokens": tokens}))
         return
     for token in coloured:
@@ -98,22 +94,6 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
         elif token not in files:
             click.echo(f"{token} = {_text_of(value, settings.order(token))}")
     _print_times(": ".join([str(bundle), *filter(None, [" ".join(written.values())])]), answer)
-
-
-def _json_of(value: Any) -> Any:
-    """Return an answer as JSON has it: a large array as its dtype and shape, NaN and infinity as text."""
-    import numpy as np
-
-    if isinstance(value, np.ndarray | np.generic):
-        if value.dtype.kind not in "biuf" or value.size > _MOST_JSON_NUMBERS:
-            return {"dtype": str(value.dtype), "shape": value.shape}
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(key): _json_of(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_of(item) for item in value]
-    is_json = value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
-    return value if is_json else str(value)
 
 
 def _text_of(value: Any, order: Order, level: int = 3) -> str:

@@ -119,6 +119,7 @@ def test_a_graph_reads_one_contract_per_token():
     assert contracts_of(gray, 1, 1) == ((RGB,), (GRAY,))
     assert contracts_of(gray, 2, 2) == ((RGB, None), (None, None)), "one mark does not say it of two outputs"
     assert contracts_of(stack, 3, 2) == ((GRAY,) * 3, (RGB,) * 2)
+    assert contracts_of(stack, 3, 1) == ((GRAY,) * 3, (None,)), "the one token is the list, which is no image"
 
 
 def test_methods_and_wrapped_functions_keep_their_contracts():
