@@ -1,4 +1,4 @@
-"""Which errors EPypes raises, and what each one carries.
+"""The errors that EPypes raises, and what each one carries.
 
 Everything an error's text mentions is an attribute of it::
 

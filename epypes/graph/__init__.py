@@ -1,4 +1,4 @@
-"""What is connected to what: computational graphs, pure and static."""
+"""Computational graphs, pure and static: what is connected to what."""
 
 from typing import TYPE_CHECKING
 

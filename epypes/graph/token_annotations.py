@@ -5,19 +5,23 @@ from __future__ import annotations
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from types import FunctionType, MethodType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
-from epypes.annotations import hints_of
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.identity import innermost
 from epypes.graph.signature import distinct, positional_names
-from epypes.hints import Param, Roi, annotated_param
+from epypes.hints import Param, Roi, param_of
 from epypes.images import Contracts, Image, mark_of
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
     from epypes.graph.validation import GraphParts
+
+_NO_HINTS: Final[Mapping[str, Any]] = {}
+# Weak, so that a function of a notebook that was defined again can go. To evaluate annotations takes some 30 us.
+_EVALUATED: Final[WeakKeyDictionary[FunctionType, Mapping[str, Any]]] = WeakKeyDictionary()
 
 
 class TokenHints(NamedTuple):
@@ -76,13 +80,39 @@ def _is_annotated(function: Any) -> bool:
     return type(function) is MethodType or innermost(function) is not function
 
 
+def _hints_of(function: object) -> Mapping[str, Any]:
+    """Return the type hints of a function by parameter, and that of ``return``; not to be changed.
+
+    ``Annotated`` is kept. Empty where there are none, and where they can't be evaluated: a name that is not defined
+    yet, a class that others have nothing to do with, whatever the text of an annotation raises.
+    """
+    if not isinstance(function, FunctionType):
+        return _evaluated(function) or _NO_HINTS
+    if not function.__annotations__:
+        return _NO_HINTS
+    hints = _EVALUATED.get(function)
+    if hints is None:
+        hints = _evaluated(function)
+        if hints is None:
+            return _NO_HINTS  # and not for good: the names may be defined later
+        _EVALUATED[function] = hints
+    return hints
+
+
+def _evaluated(function: Any) -> Mapping[str, Any] | None:
+    try:
+        return typing.get_type_hints(function, include_extras=True)
+    except Exception:  # what the text of an annotation raises is the user's
+        return None
+
+
 def _is_marked(function: Any) -> bool:
-    return any(mark_of(part) for hint in hints_of(function).values() for part in (hint, *typing.get_args(hint)))
+    return any(mark_of(part) for hint in _hints_of(function).values() for part in (hint, *typing.get_args(hint)))
 
 
 def _hints_of_tokens(function: Any, inputs: int, outputs: int | None) -> TokenHints | None:
     """Read the hints of a function with so many inputs and outputs, None for the value as it is."""
-    hints = hints_of(function)
+    hints = _hints_of(function)
     if not hints:
         return None
     names, rest = positional_names(function)
@@ -122,9 +152,11 @@ def bare(hint: Any) -> Any:
 
 
 def annotated_params(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
-    """Give the hints in the annotations of the functions that take a token, in run order."""
-    for function in cg.digraph.consumers.get(token, ()):
-        found = annotated_param(cg.functions[function], cg.func_inputs(function).index(token))
+    """Give the ranges in the annotations of the functions that take a token, in run order."""
+    for name in cg.digraph.consumers.get(token, ()):
+        function, tokens = cg.functions[name], cg.func_inputs(name)
+        hints = _hints_of_tokens(function, len(tokens), None) if _is_annotated(function) else None
+        found = param_of(hints.inputs[tokens.index(token)]) if hints is not None else None
         if found is not None:
             yield found
 
