@@ -75,7 +75,10 @@ def read_hints(parts: GraphParts, digraph: BipartiteDigraph) -> dict[str, TokenH
 
 def _is_annotated(function: Any) -> bool:
     if type(function) is FunctionType:
-        return bool(function.__annotations__)
+        try:
+            return bool(function.__annotations__)
+        except Exception:  # Python 3.14 evaluates them here; what that raises is the user's
+            return False
     # Other objects show the annotations of their class, which are not those of a call.
     return type(function) is MethodType or innermost(function) is not function
 
@@ -88,8 +91,6 @@ def _hints_of(function: object) -> Mapping[str, Any]:
     """
     if not isinstance(function, FunctionType):
         return _evaluated(function) or _NO_HINTS
-    if not function.__annotations__:
-        return _NO_HINTS
     hints = _EVALUATED.get(function)
     if hints is None:
         hints = _evaluated(function)
