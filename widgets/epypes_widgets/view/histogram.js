@@ -1,5 +1,5 @@
 // Histograms of the stage shown and of those that thresholds cut, with the thresholds as lines.
-import { consume, element, follow, note, say, shape } from "./elements.js";
+import { consume, element, follow, keep, note, say, shape } from "./elements.js";
 import { FAST, clamped, ends, shortly, stepped, written } from "./numbers.js";
 
 const NEAR_THE_END = 0.75;
@@ -71,10 +71,10 @@ export function histogramPart(panel) {
     const line = shape("line", { y1: "0", y2: "100%", class: "epypes-cut-line" });
     const text = shape("text", { y: 13 + 14 * at, class: "epypes-cut-text" });
     const label = `${name} on the histogram of ${chart.token}`;
-    const group = shape("g", { class: "epypes-cut", role: "slider", tabindex: "0", "data-name": name, "aria-label": label }, hit, line, text);
-    follow(group, () => {
+    const node = shape("g", { class: "epypes-cut", role: "slider", tabindex: "0", "data-name": name, "aria-label": label }, hit, line, text);
+    follow(node, () => {
       const box = chart.svg.getBoundingClientRect();
-      group.focus({ preventScroll: true });
+      node.focus({ preventScroll: true });
       dragged = name;
       panel.hold([name]);
       return {
@@ -89,16 +89,16 @@ export function histogramPart(panel) {
         },
       };
     });
-    group.addEventListener("keydown", (event) => {
+    node.addEventListener("keydown", (event) => {
       if (event.key === "Enter") panel.release([name]);
       const count = LINE_KEYS[event.key] * (event.shiftKey ? FAST : 1);
       if (!count) return;
       consume(event);
       moveTo(chart, name, (row, index, values) => stepped(row, index, values[index], count, values));
     });
-    group.addEventListener("blur", () => panel.commit());
-    chart.svg.append(group);
-    return { group, hit, line, text };
+    node.addEventListener("blur", () => panel.commit());
+    chart.svg.append(node);
+    return { node, hit, line, text };
   }
 
   function putLine(chart, name) {
@@ -114,9 +114,9 @@ export function histogramPart(panel) {
     say(parts.text, `${name} ${shortly(value)}`);
     const { row, index } = panel.rowOf(name) ?? {};
     const { low, high } = row ? ends(row, index, []) : chart.histogram;
-    note(parts.group, "aria-valuenow", written(value));
-    note(parts.group, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
-    note(parts.group, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
+    note(parts.node, "aria-valuenow", written(value));
+    note(parts.node, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
+    note(parts.node, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
   }
 
   function paint(token, histogram) {
@@ -138,15 +138,8 @@ export function histogramPart(panel) {
 
   function putLines(chart) {
     const names = cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
-    for (const [name, { group }] of chart.lines) {
-      if (names.includes(name)) continue;
-      group.remove();
-      chart.lines.delete(name);
-    }
-    names.forEach((name, at) => {
-      if (!chart.lines.has(name)) chart.lines.set(name, makeLine(chart, name, at));
-      if (dragged !== name) putLine(chart, name);
-    });
+    keep(chart.lines, names, (name) => makeLine(chart, name, names.indexOf(name)));
+    for (const name of names) if (dragged !== name) putLine(chart, name);
   }
 
   function show(frame = last) {

@@ -16,6 +16,8 @@ import { rowsPart } from "./rows.js";
 import { stagePart } from "./stage.js";
 import { filmsPart, historyPart, pinnedPart, videoPart } from "./strips.js";
 
+/** Messages that parts handle in a method of that name. */
+const PASSED_ON = ["latency", "history", "cases", "probe", "settings", "promoted", "written", "optimised", "log"];
 const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load", "optimise_use"];
 
 /** The line above the picture, and the one below it for what went wrong. */
@@ -168,16 +170,8 @@ function render({ model, el }) {
       stage.wait(isInPlace ? text : "");
       header.tell(isInPlace ? "" : text);
     },
-    latency: header.latency,
-    history: (message, buffers) => all("history", message, buffers),
-    cases: films.cases,
-    probe: probe.message,
-    settings: foot.settings,
-    promoted: foot.promoted,
-    written: foot.written,
-    optimised: optimise.optimised,
-    log: foot.log,
   };
+  for (const kind of PASSED_ON) handlers[kind] = (...given) => all(kind, ...given);
   const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);
   model.on("msg:custom", onMessage);
   const mount = mounted(figure, "epypes-live", send);
