@@ -58,8 +58,7 @@ export function rowsPart(panel, figure) {
     found.set(row, { node, tail, boxes, reset, sign });
     nameHandles(row);
     if (boxes.length) bind(row);
-    markChanged(row);
-    markFault(row);
+    mark(row);
   }
 
   /** Sliders of the library have no names of their own. */
@@ -79,10 +78,11 @@ export function rowsPart(panel, figure) {
   /** A slider has come to a place. */
   function moved(row, value) {
     found.get(row)?.boxes.forEach((box, index) => box.moved(shownAt(row, [value].flat()[index])));
-    markChanged(row);
+    mark(row);
   }
 
-  function markChanged(row) {
+  /** Show on a row whether it differs from its default, and whether a function failed by it. */
+  function mark(row) {
     const parts = found.get(row);
     if (!parts) return;
     const isChanged = row.names.some((name, index) => {
@@ -91,11 +91,6 @@ export function rowsPart(panel, figure) {
     });
     parts.node.classList.toggle("epypes-changed", isChanged);
     parts.reset.disabled = !isChanged;
-  }
-
-  function markFault(row) {
-    const parts = found.get(row);
-    if (!parts) return;
     const isAtFault = row.names.some((name) => failed?.names?.includes(name));
     parts.node.classList.toggle("epypes-failed", isAtFault);
     say(parts.sign, isAtFault ? "!" : "");
@@ -201,13 +196,13 @@ export function rowsPart(panel, figure) {
       last = frame;
       for (const row of rows) {
         found.get(row)?.boxes.forEach((box) => box.name in frame.values && box.ran(frame.values[box.name]));
-        markChanged(row);
+        mark(row);
       }
       folders.forEach(describe);
     },
     failure(failure) {
       failed = failure;
-      rows.forEach(markFault);
+      rows.forEach(mark);
       folders.forEach(describe);
     },
     rowOf(name) {
