@@ -43,7 +43,6 @@ export function histogramPart(panel) {
   let cuts = [];
   let isOn = false;
   let isLogarithmic = false;
-  let dragged = "";
   let last = null;
   let isSetUp = false;
 
@@ -61,9 +60,8 @@ export function histogramPart(panel) {
     if (!found) return;
     const { row, index } = found;
     const next = moved(row, index, row.names.map((one) => panel.state.values[one]));
-    panel.state.values[name] = next;
+    panel.change(name, next, false);
     putLine(chart, name);
-    panel.set({ [name]: next }, false);
   }
 
   function makeLine(chart, name, at) {
@@ -75,17 +73,15 @@ export function histogramPart(panel) {
     follow(node, () => {
       const box = chart.svg.getBoundingClientRect();
       node.focus({ preventScroll: true });
-      dragged = name;
-      panel.hold([name]);
+      panel.grab(name);
       return {
         move({ clientX }) {
           const value = valueAt(chart.histogram, (clientX - box.left) / box.width);
           moveTo(chart, name, (row, index, values) => clamped(row, index, value, values));
         },
         end() {
-          dragged = "";
-          panel.set({ [name]: panel.state.values[name] }, true);
-          panel.release([name]);
+          panel.change(name, panel.state.values[name], true);
+          panel.letGo(name);
         },
       };
     });
@@ -139,7 +135,7 @@ export function histogramPart(panel) {
   function putLines(chart) {
     const names = cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
     keep(chart.lines, names, (name) => makeLine(chart, name, names.indexOf(name)));
-    for (const name of names) if (dragged !== name) putLine(chart, name);
+    for (const name of names) if (!panel.isHeld(name)) putLine(chart, name);
   }
 
   function show(frame = last) {
@@ -178,6 +174,5 @@ export function histogramPart(panel) {
     },
     get isOn() { return isOn; },
     get isLogarithmic() { return isLogarithmic; },
-    isHeld: (name) => dragged === name,
   };
 }

@@ -77,6 +77,7 @@ function render({ model, el }) {
   const failed = failures();
   let described = null;
   let shownFailure = null;
+  let held = "";
   /** What the parts share. */
   const panel = {
     ...out,
@@ -84,6 +85,20 @@ function render({ model, el }) {
     compare: /** @type {any} */ (null),
     state: { token: "", values: {} },
     tell: (text, isPassing) => header.tell(text, isPassing),
+    change(name, value, commit) {
+      panel.state.values[name] = value;
+      out.set({ [name]: value }, commit);
+    },
+    /** A value is dragged on a picture: no frame moves it until it is let go. */
+    grab(name) {
+      held = name;
+      out.hold([name]);
+    },
+    letGo(name) {
+      held = "";
+      out.release([name]);
+    },
+    isHeld: (name) => held === name,
     /** Write down what a frame has beside its picture once it has been painted; only the newest if several come. */
     describe(report) {
       if (!described) setTimeout(describe);
@@ -131,8 +146,7 @@ function render({ model, el }) {
     const { frame } = report;
     panel.state.token = frame.token;
     for (const [name, value] of Object.entries(frame.values)) {
-      const isHeld = roi.isHeld(name) || histogram.isHeld(name);
-      if (!isHeld && out.takes(name, value)) panel.state.values[name] = value;
+      if (name !== held && out.takes(name, value)) panel.state.values[name] = value;
     }
     figure.classList.remove("epypes-empty");
     tellFailure();

@@ -46,7 +46,6 @@ export function roiPart(panel, stage) {
   const drawn = new Map();
   let entries = [];
   let isDrawing = false;
-  let dragged = "";
   const sizes = new Map();
 
   const valueOf = (name) => (isRectangle(panel.state.values[name]) ? panel.state.values[name] : whole(stage.size));
@@ -60,9 +59,8 @@ export function roiPart(panel, stage) {
   }
 
   function change(name, value, commit) {
-    panel.state.values[name] = value;
+    panel.change(name, value, commit);
     paint(name);
-    panel.set({ [name]: value }, commit);
   }
 
   /** Follow a drag on a node: `moved` returns the rectangle; Escape gives back the one before. */
@@ -78,8 +76,7 @@ export function roiPart(panel, stage) {
       node.releasePointerCapture(event.pointerId);
     };
     window.addEventListener("keydown", cancel, true);
-    dragged = name;
-    panel.hold([name]);
+    panel.grab(name);
     return {
       move(later) {
         last = moved(start, from, at(later));
@@ -87,9 +84,8 @@ export function roiPart(panel, stage) {
       },
       end() {
         window.removeEventListener("keydown", cancel, true);
-        dragged = "";
         change(name, last, true);
-        panel.release([name]);
+        panel.letGo(name);
         setDrawing(false);
         drawn.get(name).frame.focus({ preventScroll: true });
       },
@@ -139,7 +135,7 @@ export function roiPart(panel, stage) {
     for (const entry of entries) {
       const isShown = fits(entry);
       drawn.get(entry.name).node.style.display = isShown ? "" : "none";
-      if (isShown && dragged !== entry.name) paint(entry.name);
+      if (isShown && !panel.isHeld(entry.name)) paint(entry.name);
     }
   }
 
@@ -170,6 +166,5 @@ export function roiPart(panel, stage) {
     stop: () => setDrawing(false),
     get isDrawing() { return isDrawing; },
     get exists() { return entries.length > 0; },
-    isHeld: (name) => dragged === name,
   };
 }
