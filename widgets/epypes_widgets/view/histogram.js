@@ -61,7 +61,7 @@ export function histogramPart(panel) {
     const { row, index } = found;
     const next = moved(row, index, row.names.map((one) => panel.state.values[one]));
     panel.change(name, next, false);
-    putLine(chart, name);
+    chart.lines.get(name)?.put();
   }
 
   function makeLine(chart, name, at) {
@@ -94,25 +94,25 @@ export function histogramPart(panel) {
     });
     node.addEventListener("blur", () => panel.commit());
     chart.svg.append(node);
-    return { node, hit, line, text };
-  }
 
-  function putLine(chart, name) {
-    const parts = chart.lines.get(name);
-    const value = panel.state.values[name];
-    if (!parts || typeof value !== "number") return;
-    const share = shareOf(chart.histogram, value);
-    const [x, isNearEnd] = [`${(share * 100).toFixed(3)}%`, share > NEAR_THE_END];
-    for (const line of [parts.hit, parts.line]) for (const end of ["x1", "x2"]) note(line, end, x);
-    note(parts.text, "x", x);
-    note(parts.text, "dx", isNearEnd ? -5 : 5);
-    note(parts.text, "text-anchor", isNearEnd ? "end" : "start");
-    say(parts.text, `${name} ${shortly(value)}`);
-    const { row, index } = panel.rowOf(name) ?? {};
-    const { low, high } = row ? ends(row, index, []) : chart.histogram;
-    note(parts.node, "aria-valuenow", written(value));
-    note(parts.node, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
-    note(parts.node, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
+    /** Stand where the value is. */
+    function put() {
+      const value = panel.state.values[name];
+      if (typeof value !== "number") return;
+      const share = shareOf(chart.histogram, value);
+      const [x, isNearEnd] = [`${(share * 100).toFixed(3)}%`, share > NEAR_THE_END];
+      for (const drawn of [hit, line]) for (const end of ["x1", "x2"]) note(drawn, end, x);
+      note(text, "x", x);
+      note(text, "dx", isNearEnd ? -5 : 5);
+      note(text, "text-anchor", isNearEnd ? "end" : "start");
+      say(text, `${name} ${shortly(value)}`);
+      const { row, index } = panel.rowOf(name) ?? {};
+      const { low, high } = row ? ends(row, index, []) : chart.histogram;
+      note(node, "aria-valuenow", written(value));
+      note(node, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
+      note(node, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
+    }
+    return { node, put };
   }
 
   function paint(token, histogram) {
@@ -135,7 +135,7 @@ export function histogramPart(panel) {
   function putLines(chart) {
     const names = cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
     keep(chart.lines, names, (name) => makeLine(chart, name, names.indexOf(name)));
-    for (const name of names) if (!panel.isHeld(name)) putLine(chart, name);
+    for (const name of names) if (!panel.isHeld(name)) chart.lines.get(name).put();
   }
 
   function show(frame = last) {

@@ -60,7 +60,7 @@ export function roiPart(panel, stage) {
 
   function change(name, value, commit) {
     panel.change(name, value, commit);
-    paint(name);
+    drawn.get(name).paint();
   }
 
   /** Follow a drag on a node: `moved` returns the rectangle; Escape gives back the one before. */
@@ -114,28 +114,27 @@ export function roiPart(panel, stage) {
     frame.addEventListener("keydown", (event) => onKey(event, name));
     frame.addEventListener("blur", () => panel.commit());
     stage.roi.append(node);
-    return { node, frame, shadow, handles };
-  }
 
-  function paint(name) {
-    const { node, frame, shadow, handles } = drawn.get(name);
-    const [x, y, width, height] = valueOf(name);
-    for (const rect of [frame, shadow]) place(rect, [x, y, width, height]);
-    note(frame, "aria-label", `${name}: ${width} by ${height} pixels at ${x}, ${y}. Arrows move it, with Shift they resize it, Delete takes the whole picture.`);
-    // A rectangle that is all of the picture is not moved, so a drag inside it pans.
-    node.classList.toggle("epypes-roi-whole", width === stage.size.width && height === stage.size.height);
-    const side = HANDLE_PX / stage.place.scale;
-    HANDLES.forEach((handle, index) => {
-      const along = (low, high, length) => (handle.includes(low) ? 0 : handle.includes(high) ? length : length / 2);
-      place(handles[index], [x + along("w", "e", width) - side / 2, y + along("n", "s", height) - side / 2, side, side]);
-    });
+    function paint() {
+      const [x, y, width, height] = valueOf(name);
+      for (const rect of [frame, shadow]) place(rect, [x, y, width, height]);
+      note(frame, "aria-label", `${name}: ${width} by ${height} pixels at ${x}, ${y}. Arrows move it, with Shift they resize it, Delete takes the whole picture.`);
+      // A rectangle that is all of the picture is not moved, so a drag inside it pans.
+      node.classList.toggle("epypes-roi-whole", width === stage.size.width && height === stage.size.height);
+      const side = HANDLE_PX / stage.place.scale;
+      HANDLES.forEach((handle, index) => {
+        const along = (low, high, length) => (handle.includes(low) ? 0 : handle.includes(high) ? length : length / 2);
+        place(handles[index], [x + along("w", "e", width) - side / 2, y + along("n", "s", height) - side / 2, side, side]);
+      });
+    }
+    return { node, frame, paint };
   }
 
   function show() {
     for (const entry of entries) {
       const isShown = fits(entry);
       drawn.get(entry.name).node.style.display = isShown ? "" : "none";
-      if (isShown && !panel.isHeld(entry.name)) paint(entry.name);
+      if (isShown && !panel.isHeld(entry.name)) drawn.get(entry.name).paint();
     }
   }
 

@@ -7,6 +7,8 @@ import { sawGroup } from "./replicas.js";
 import { ask, confirmed, entries, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
 
 const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error", LOST: "error" };
+/** The states in which each operation makes sense. */
+const OPERATIONS = { pause: ["READY", "DEGRADED"], resume: ["PAUSED", "DRAINING"], drain: ["READY", "PAUSED", "DEGRADED"] };
 const DIGITS = 12;
 
 let state = "";
@@ -44,9 +46,7 @@ async function loadInfo() {
 }
 
 function showOperations() {
-  part("pause").disabled = !hasToken() || !["READY", "DEGRADED"].includes(state);
-  part("resume").disabled = !hasToken() || !["PAUSED", "DRAINING"].includes(state);
-  part("drain").disabled = !hasToken() || !["READY", "PAUSED", "DEGRADED"].includes(state);
+  for (const [name, states] of Object.entries(OPERATIONS)) part(name).disabled = !hasToken() || !states.includes(state);
 }
 
 async function operate(path, body = undefined) {
