@@ -96,14 +96,13 @@ export function follow(node, begin) {
     if (!drag) return;
     event.preventDefault();
     event.stopImmediatePropagation();
-    const moved = (later) => drag.move(later);
+    const over = new AbortController();
     node.setPointerCapture(event.pointerId);
-    node.addEventListener("pointermove", moved);
-    const ended = () => {
-      node.removeEventListener("pointermove", moved);
+    node.addEventListener("pointermove", drag.move, { signal: over.signal });
+    node.addEventListener("lostpointercapture", () => {
+      over.abort();
       drag.end?.();
-    };
-    node.addEventListener("lostpointercapture", ended, { once: true });
+    }, { once: true });
   });
 }
 
@@ -137,39 +136,18 @@ export function fill(img, bytes, type = "image/jpeg") {
   return undefined;
 }
 
-/** Call back with the closest element of a selector once a node is in the page; return what ends that. */
-export function whenInside(node, selector, found) {
-  const sizes = new ResizeObserver(() => {
-    const outer = node.closest(selector);
-    if (!outer) return;
-    sizes.disconnect();
-    found(outer);
-  });
-  sizes.observe(node);
-  return () => sizes.disconnect();
-}
-
 /**
- * Send "ready" until it is answered, and hide the static output below a living view; return what ends both.
+ * Send "ready" until it is answered; return what ends that.
  *
  * Until JupyterLab has a thread for widgets beside that of the cells, a message waits for a cell that runs: then it is
  * sent again, and the thread that is there by then handles it.
  */
-export function mounted(root, live, send) {
+export function announced(send) {
   let knocking = 0;
-  let area = null;
   const knock = (answer_ms) => {
     send({ kind: "ready" });
     knocking = setTimeout(() => knock(Math.min(2 * answer_ms, LAST_ANSWER_MS)), answer_ms);
   };
-  const stopLooking = whenInside(root, ".jp-OutputArea", (found) => (area = found).classList.add(live));
   knock(FIRST_ANSWER_MS);
-  return {
-    answered: () => clearTimeout(knocking),
-    close() {
-      clearTimeout(knocking);
-      stopLooking();
-      area?.classList.remove(live);
-    },
-  };
+  return () => clearTimeout(knocking);
 }

@@ -2,7 +2,7 @@
 import { barPart } from "./bar.js";
 import { chipsPart } from "./chips.js";
 import { comparePart } from "./compare.js";
-import { element, mounted, note, say } from "./elements.js";
+import { announced, element, note, say } from "./elements.js";
 import { footPart } from "./foot.js";
 import { clear, failures, framesPart } from "./frames.js";
 import { histogramPart } from "./histogram.js";
@@ -122,7 +122,7 @@ function render({ model, el }) {
   const histogram = histogramPart(panel);
   bar = barPart(panel, { stage, compare, histogram, probe, roi });
   const chips = chipsPart(panel);
-  const rows = rowsPart(panel, figure);
+  const rows = rowsPart(panel, figure, closing.signal);
   const pinned = pinnedPart(panel);
   const films = filmsPart(panel);
   const video = videoPart(panel);
@@ -161,7 +161,7 @@ function render({ model, el }) {
   }
 
   function setup(message, buffers) {
-    mount.answered();
+    answered();
     panel.state.token = message.token ?? "";
     all("setup", message, buffers);
     // What asks the kernel to compute rests with a panel that is closed; its picture can still be looked at.
@@ -188,14 +188,13 @@ function render({ model, el }) {
   for (const kind of PASSED_ON) handlers[kind] = (...given) => all(kind, ...given);
   const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);
   model.on("msg:custom", onMessage);
-  const mount = mounted(figure, "epypes-live", send);
+  const answered = announced(send);
   return () => {
-    mount.close();
+    answered();
     closing.abort();
     send({ kind: "closed" });
     model.off("msg:custom", onMessage);
     out.close();
-    rows.close();
     stage.close();
     [stage.picture, stage.other].forEach((img) => clear(img));
     figure.remove();

@@ -1,5 +1,5 @@
 // The contact sheet of a sweep, one tile of which is chosen with the mouse or with the keyboard.
-import { ARROWS, button, element, mounted, note, say } from "./elements.js";
+import { ARROWS, announced, button, element, note, say } from "./elements.js";
 
 /** Straight on before aside. */
 const ASIDE = 4;
@@ -71,7 +71,7 @@ function render({ model, el }) {
   }
 
   function showSheet(message, buffers) {
-    mount.answered();
+    answered();
     urls.forEach(URL.revokeObjectURL);
     const media = {};
     message.blocks.forEach(({ rows }) => rows.flat(2).forEach(({ picture, media_type }) => (media[picture] = media_type)));
@@ -115,9 +115,9 @@ function render({ model, el }) {
 
   const onMessage = (message, buffers) => (message.kind === "sheet" ? showSheet(message, buffers ?? []) : showState(message));
   model.on("msg:custom", onMessage);
-  const mount = mounted(root, "epypes-picker-live", send);
+  const answered = announced(send);
   return () => {
-    mount.close();
+    answered();
     model.off("msg:custom", onMessage);
     urls.forEach(URL.revokeObjectURL);
     root.remove();

@@ -1,12 +1,12 @@
 // What is added to the controls of ipywidgets: number boxes, resets, marks, folding and the filter.
-import { consume, element, iconButton, note, say, whenInside } from "./elements.js";
+import { consume, element, iconButton, note, say } from "./elements.js";
 import { numberBox } from "./number_box.js";
 import { inMs, modelValue, same, shortly, shownAt } from "./numbers.js";
 
 const NUMERIC = ["slider", "range", "log"];
 
-/** Decorates the rows of the panel that this view is in; they may come later than the view. */
-export function rowsPart(panel, figure) {
+/** Decorates the rows of the panel that this view is in until the signal; they may come later than the view. */
+export function rowsPart(panel, figure, signal) {
   let rows = [];
   let folders = [];
   let given = "";
@@ -15,17 +15,21 @@ export function rowsPart(panel, figure) {
   const found = new Map();
   let last = null;
   let failed = null;
-  const closing = new AbortController();
-  const until = { signal: closing.signal };
   const seeker = new MutationObserver(seek);
-
-  const stopLooking = whenInside(figure, ".epypes-panel", (outer) => {
-    root = outer;
-    root.addEventListener("pointerdown", onDown, { capture: true, ...until });
-    root.addEventListener("keydown", onEnter, { capture: true, ...until });
-    root.addEventListener("input", (event) => event.target.closest?.(".epypes-filter") && filter(), until);
-    root.addEventListener("focusin", (event) => nameHandles(rowAt(event.target)), until);
+  const placed = new ResizeObserver(() => {
+    root = figure.closest(".epypes-panel");
+    if (!root) return;
+    placed.disconnect();
+    root.addEventListener("pointerdown", onDown, { capture: true, signal });
+    root.addEventListener("keydown", onEnter, { capture: true, signal });
+    root.addEventListener("input", (event) => event.target.closest?.(".epypes-filter") && filter(), { signal });
+    root.addEventListener("focusin", (event) => nameHandles(rowAt(event.target)), { signal });
     seek();
+  });
+  placed.observe(figure);
+  signal.addEventListener("abort", () => {
+    for (const observer of [placed, seeker]) observer.disconnect();
+    clear();
   });
 
   function seek() {
@@ -85,12 +89,12 @@ export function rowsPart(panel, figure) {
     for (const [name, value] of Object.entries(attributes)) note(heading, name, value);
     heading.append(added);
     const fold = () => note(heading, "aria-expanded", !node.classList.toggle("epypes-folded"));
-    heading.addEventListener("click", fold, until);
+    heading.addEventListener("click", fold, { signal });
     heading.addEventListener("keydown", (event) => {
       if (!["Enter", " "].includes(event.key)) return;
       consume(event);
       fold();
-    }, until);
+    }, { signal });
 
     /** Show how long the function took, and whether it failed. */
     function update() {
@@ -112,10 +116,10 @@ export function rowsPart(panel, figure) {
   async function bind(row) {
     nameHandles(row);
     const model = await panel.widgetModel(row.model);
-    if (!model || closing.signal.aborted) return;
+    if (!model || signal.aborted) return;
     const update = () => moved(row, model.get("value"));
     model.on("change:value", update);
-    closing.signal.addEventListener("abort", () => model.off("change:value", update));
+    signal.addEventListener("abort", () => model.off("change:value", update));
     update();
   }
 
@@ -201,12 +205,6 @@ export function rowsPart(panel, figure) {
     rowOf(name) {
       const row = rows.find((one) => one.names.includes(name));
       return row ? { row, index: row.names.indexOf(name) } : null;
-    },
-    close() {
-      closing.abort();
-      stopLooking();
-      seeker.disconnect();
-      clear();
     },
   };
 }
