@@ -31,8 +31,6 @@ Durations = dict[int, int] | Sequence[int]
 Times = tuple[Program, bytes | None, Durations, int, bool, int, tuple[int, ...]]
 
 KEPT: Final = 1_000
-# Packed above that: a thousand reports would hold a gigabyte of integers.
-_MAX_UNPACKED: Final = 400
 _COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed", "skipped")
 _SUMMARY_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
 _STANDARD: Final = NormalDist()
@@ -203,19 +201,18 @@ class RunReport:
         return mimebundle(self)
 
 
+def packed(program: Program, durations_ns: dict[int, int]) -> Durations:
+    """Return the durations of a run of a large graph as they are kept; few are kept as they are."""
+    if 4 * len(durations_ns) < len(program.steps):
+        return durations_ns
+    return array("q", [durations_ns.get(step.place, -1) for step in program.steps])
+
+
 class Reports(Sequence[RunReport]):
     """The reports of a runner's last 1,000 runs, the oldest first; without the values of their tokens."""
 
     def __init__(self) -> None:
         self.kept: deque[Times] = deque(maxlen=KEPT)
-
-    def add(self, times: Times) -> None:
-        """Keep the times of one more run."""
-        durations_ns = times[2]
-        if len(durations_ns) > _MAX_UNPACKED and isinstance(durations_ns, dict):
-            packed = array("q", [durations_ns.get(step.place, -1) for step in times[0].steps])
-            times = (*times[:2], packed, *times[3:])
-        self.kept.append(times)
 
     @overload
     def __getitem__(self, index: int) -> RunReport: ...

@@ -247,6 +247,9 @@ def test_the_page_lists_what_the_tables_have():
     parameters = {f"{old}=": (f"{new}=", True) for old, new in deprecation.RENAMED.items()}
     parameters |= {f"{old}=": (new, False) for old, new in deprecation.REMOVED.items()}
     assert parameters == PARAMETER_ROWS
+    assert {kind: set(names) for kind, names in deprecation.OLD_MEMBERS.items()} == {
+        kind: set(names) for kind, names in compat.MEMBERS.items()
+    }
 
 
 def test_every_name_that_works_is_tried_here():
