@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from copy import copy
 from time import perf_counter_ns
 from typing import Any, Final
@@ -29,7 +28,6 @@ Payload = Mapping[str, Any]
 
 _LOG: Final = logging.getLogger(__name__)
 _MAX_TARGETS: Final = 64
-_NO_SERIES: Final = nullcontext()
 
 
 class CompGraphRunner(OldNames, TokenMapping):
@@ -120,7 +118,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         # The run that failed last on each thread: `last` may be another thread's run by then.
         self._failed = threading.local()
         # Held by a run with state: the next one begins with what it leaves.
-        self._series = threading.RLock() if self._program.states else None
+        self._series = threading.RLock()
 
     # -- running ------------------------------------------------------------------------------------------------
 
@@ -161,10 +159,10 @@ class CompGraphRunner(OldNames, TokenMapping):
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
-        hparams, series = self._hparams, self._series
-        if series is None:
+        hparams = self._hparams
+        if not self._program.states:
             return self._run(hparams.tokens(payload, ()), hparams, targets, start_ns)
-        with series:
+        with self._series:
             return self._run(hparams.tokens(payload, self._kept), hparams, targets, start_ns)
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
@@ -181,7 +179,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         Exception
             Whatever a function raises, unchanged, with a note.
         """
-        if self._series is None:
+        if not self._program.states:
             return self._go_on(changes, targets)
         with self._series:
             return self._go_on(changes, targets)
@@ -335,7 +333,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         key, before, last, kept = getattr(run, "trial_of", (None,) * 4)
         if key is not self._key:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
-        with self._series or _NO_SERIES, self._lock:
+        with self._series, self._lock:
             is_as_it_was = before is self._hparams and (None if last is None else last()) is self.last
             if not is_as_it_was or kept is not self._kept:
                 return False
@@ -453,8 +451,18 @@ class CompGraphRunner(OldNames, TokenMapping):
         """Have the next run begin with the initial state; the last run stays, and ``rerun`` repeats it as it was."""
         self._begin_with(self._initial_state())
 
+    def call_with_state(self, state: Mapping[str, Any], call: Callable[[], Any]) -> tuple[Any, Mapping[str, Any]]:
+        """Call what runs this graph with a state that the caller keeps; return its value and the state after."""
+        with self._series:
+            own = self._kept
+            self.state = state
+            try:
+                return call(), self.state
+            finally:
+                self._kept = own
+
     def _begin_with(self, kept: tuple[Any, ...]) -> None:
-        with self._series or _NO_SERIES, self._lock:
+        with self._series, self._lock:
             self._kept = kept
         self._tell_watchers()
 

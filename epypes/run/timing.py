@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, overload
 
 from epypes.optional import optional_import
-from epypes.rich_display import mimebundle, to_text
+from epypes.rich_display import Displayed
 from epypes.run.program import Program
 from epypes.wording import counted
 
@@ -75,7 +75,7 @@ class FunctionTime:
         return not self.ran and not self.skipped
 
 
-class RunReport:
+class RunReport(Displayed):
     """The times of one run; does not change.
 
     Attributes
@@ -190,16 +190,6 @@ class RunReport:
         ran, more = len(self.ran) - failed, f", {skipped} skipped" * bool(skipped) + ", 1 failed" * failed
         return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{more}>"
 
-    def __str__(self) -> str:
-        from epypes.rich_display import to_text
-
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.rich_display import mimebundle
-
-        return mimebundle(self)
-
 
 def packed(program: Program, durations_ns: dict[int, int]) -> Durations:
     """Return the durations of a run of a large graph as they are kept; few are kept as they are."""
@@ -208,7 +198,7 @@ def packed(program: Program, durations_ns: dict[int, int]) -> Durations:
     return array("q", [durations_ns.get(step.place, -1) for step in program.steps])
 
 
-class Reports(Sequence[RunReport]):
+class Reports(Displayed, Sequence[RunReport]):
     """The reports of a runner's last 1,000 runs, the oldest first; without the values of their tokens."""
 
     def __init__(self) -> None:
@@ -239,16 +229,6 @@ class Reports(Sequence[RunReport]):
 
     def __repr__(self) -> str:
         return f"<Reports of {counted(len(self), 'run')}>"
-
-    def __str__(self) -> str:
-        from epypes.rich_display import to_text
-
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.rich_display import mimebundle
-
-        return mimebundle(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,7 +325,7 @@ class LogNormal:
 
 
 @dataclass(frozen=True, slots=True)
-class TimingSummary:
+class TimingSummary(Displayed):
     """The times of many runs, without those that failed; shows itself as bars and as a table.
 
     Of fewer than 5 durations no range from 5 % to 95 % is shown: few runs say nothing of the tails.
@@ -393,12 +373,6 @@ class TimingSummary:
     def __repr__(self) -> str:
         functions = len(self.functions)
         return f"<TimingSummary: {counted(self.runs, 'run')}, {counted(functions, 'function')}>"
-
-    def __str__(self) -> str:
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return mimebundle(self)
 
 
 def summarize(reports: Iterable[RunReport]) -> TimingSummary:

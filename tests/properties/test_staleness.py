@@ -27,7 +27,6 @@ from epypes.errors import NotComputed, PayloadError, PlaceholderNeeded
 from epypes.run import execute
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.program import Program
-from epypes.run.staleness import NOT_COMPUTED
 
 NOT_COMPUTED = object()
 VALUES = st.integers(0, 4)
