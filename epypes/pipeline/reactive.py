@@ -176,7 +176,7 @@ class _Answering(Pipeline):
         view = self._events.get(get_ident())
         if view is None or view.event is not event:
             view = EventView(self.name, event, "f_out")
-        view.run, view.attributes = run, dict(self.attributes)
+        view.run, view.attributes = run, self.attributes.copy()
         view.f_out_start = perf_counter_ns()
         answer = self.f_out(view)
         view.f_out_end = perf_counter_ns()
@@ -331,7 +331,7 @@ class SinkPipeline(Pipeline):
             view.stage = "f_out"
             if f_out is None:
                 self.emit(event, run)
-            else:
+            else:  # as emit does it, with what has been looked up
                 view.run, view.attributes = run, self.attributes.copy()
                 view.f_out_start = clock()
                 answer = f_out(view)
@@ -578,13 +578,24 @@ def queue_stage(name: str, queue: Any, *, is_waited_for: bool = False) -> Stage:
     is_waited_for
         Whether an answer waits to be put on it.
     """
-    size, limit = _qsize(queue), _limit(queue)
-    notes = [f"{type(queue).__name__} {queue.policy}" if isinstance(queue, Mailbox) else type(queue).__name__]
+    kind, is_mailbox = type(queue).__name__, isinstance(queue, Mailbox)
+    size, limit = _number(queue, "qsize"), _number(queue, "size" if is_mailbox else "maxsize")
+    notes = [f"{kind} {queue.policy}" if is_mailbox else kind]
     if size is not None:
-        notes.append(f"{size} of {limit} waiting" if limit else f"{size} waiting")
-    if isinstance(queue, Mailbox):
-        notes += _dropped(queue.dropped)
+        notes.append(f"{size} of {limit} waiting" if limit is not None and limit > 0 else f"{size} waiting")
+    if is_mailbox:
+        # A copy, since a producer may drop for another reason meanwhile.
+        notes += [f"{count} dropped: {reason}" for reason, count in dict(queue.dropped).items()]
     return Stage("queue", name, "running" if is_waited_for else "static", tuple(notes))
+
+
+def _number(queue: Any, name: str) -> int | None:
+    """Return a number that a queue has or returns; None if it does not."""
+    with contextlib.suppress(Exception):  # a multiprocessing queue has a qsize that raises on some systems
+        found = getattr(queue, name)
+        found = found() if callable(found) else found
+        return found if type(found) is int else None
+    return None
 
 
 def _loop_stage(loop: EventLoop, failed: int) -> Stage:
@@ -606,24 +617,3 @@ def _function_name(function: Any) -> str:
         if isinstance(name, str):
             return name
     return type(function).__name__
-
-
-def _qsize(queue: Any) -> int | None:
-    """Return the size of a queue, if it has one that is a number."""
-    with contextlib.suppress(Exception):  # a multiprocessing queue has a qsize that raises on some systems
-        count = queue.qsize()
-        return count if type(count) is int else None
-    return None
-
-
-def _limit(queue: Any) -> int:
-    """Return how many items a queue holds; 0 if there is no limit, or none is known."""
-    with contextlib.suppress(Exception):
-        limit = queue.size if isinstance(queue, Mailbox) else queue.maxsize
-        return limit if type(limit) is int and limit > 0 else 0
-    return 0
-
-
-def _dropped(dropped: Mapping[str, int]) -> list[str]:
-    # A copy, since a producer may drop for another reason meanwhile.
-    return [f"{count} dropped: {reason}" for reason, count in dict(dropped).items()]

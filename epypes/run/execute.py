@@ -14,6 +14,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextvars import copy_context
 from functools import partial
+from graphlib import TopologicalSorter
 from sys import getrefcount
 from time import perf_counter_ns
 from types import BuiltinFunctionType
@@ -146,9 +147,8 @@ def run_one_by_one(tokens: TokenManager) -> None:
             try:
                 made = call(program, step, values, durations_ns)
             except NothingGiven:
-                tokens.skip(step)
-            else:
-                store(step, made)
+                made = None
+            store(step, made)
         place = next_dirty(1, place + 1)
 
 
@@ -440,20 +440,22 @@ class SideBySide:
         self._changed = threading.Condition()
         stale = program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), values)
         steps = {place for place in stale if wanted is None or wanted[place]}
-        self._waits_for = {
-            place: steps.intersection(program.makers[slot] for slot in program.read_by(program.steps[place], values))
-            for place in steps
-        }
-        self._followers: dict[int, list[int]] = {place: [] for place in steps}
-        for place, makers in self._waits_for.items():
-            for maker in makers:
-                self._followers[maker].append(place)
-        self._ready = sorted(place for place in steps if not self._waits_for[place])
+        self._count = len(steps)
+        self._sorter = TopologicalSorter(
+            {
+                place: steps.intersection(
+                    program.makers[slot] for slot in program.read_by(program.steps[place], values)
+                )
+                for place in steps
+            }
+        )
+        self._sorter.prepare()
+        self._ready = sorted(self._sorter.get_ready())
 
     def run(self) -> None:
         """Run all steps; raise what the first failed one in run order has raised."""
         tokens = self._tokens
-        for _ in range(min(self._workers, len(self._waits_for)) - 1):
+        for _ in range(min(self._workers, self._count) - 1):
             # numpy's errstate, for one, belongs to the context.
             threading.Thread(target=copy_context().run, args=(self._work,), name="epypes worker", daemon=True).start()
         try:
@@ -470,8 +472,6 @@ class SideBySide:
                 step = tokens.program.steps[place]
                 if place > failed_at:
                     self._durations_ns.pop(place, None)
-                elif made is None:
-                    tokens.skip(step)
                 else:
                     tokens.store(step, made)
             for place in self._failures:
@@ -515,10 +515,7 @@ class SideBySide:
         self._calls.discard(place)
         if failure is None:
             self._made[place] = made
-            if made is None:
-                tokens.skip(step)
-            else:
-                tokens.store(step, made)
+            tokens.store(step, made)
             self._release(place)
         else:
             self._failures[place] = failure
@@ -531,15 +528,12 @@ class SideBySide:
         """Make ready what waited for a step alone; what is up to date after all is passed over."""
         passed = [done]
         while passed:
-            done = passed.pop()
-            for place in self._followers[done]:
-                self._waits_for[place].discard(done)
-                if self._waits_for[place]:
-                    continue
+            self._sorter.done(*passed)
+            ready = self._sorter.get_ready()
+            passed = [place for place in ready if not self._tokens.dirty[place]]
+            for place in ready:
                 if self._tokens.dirty[place]:
                     heapq.heappush(self._ready, place)
-                else:
-                    passed.append(place)
 
 
 class _Call:

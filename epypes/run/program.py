@@ -350,10 +350,14 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
     switches = {name: as_switch(cg.functions[name]) for name in cg.switches}
     sides = zip(cg.digraph.inputs.values(), cg.digraph.outputs.values(), cg.func_io.values(), strict=True)
     for place, ((name, function), (inputs, outputs, io)) in enumerate(zip(cg.functions.items(), sides, strict=True)):
-        function = called_for(name, function)
-        unguarded, switch, contract = is_unguarded(function), switches.get(name), contracts.get(name)
-        in_out = in_out_places(function, len(inputs))
-        has_node = hasattr(type(function), IS_ITS_FUNC) and getattr(function, IS_ITS_FUNC)
+        switch, contract = switches.get(name), contracts.get(name)
+        unguarded, has_node = False, False
+        in_out: tuple[int, ...] = ()
+        # Of large graphs most functions are made by def alone.
+        if type(function) is not FunctionType or function.__dict__:
+            function = called_for(name, function)
+            unguarded, in_out = is_unguarded(function), in_out_places(function, len(inputs))
+            has_node = hasattr(type(function), IS_ITS_FUNC) and getattr(function, IS_ITS_FUNC)
         yield _new_step((
             place,
             name,

@@ -97,8 +97,8 @@ class TokenManager(OldNames):
 
     # Slots: a class attribute that an object reads in their place takes several times as long.
     __slots__ = (
-        "_new", "_stale", "changed", "dirty", "durations_ns", "has_payload", "origin", "program", "revisions", "running",
-        "side_by_side", "values", "wanted",
+        "_new", "_stale", "changed", "dirty", "durations_ns", "has_payload", "origin", "program", "revisions",
+        "running", "side_by_side", "values", "wanted",
     )  # fmt: skip
     program: Program
     values: list[Any]
@@ -128,13 +128,8 @@ class TokenManager(OldNames):
         self, program: Program, values: list[Any], dirty: bytes, has_payload: bool, origin: bytes | None
     ) -> TokenManager:
         """Make these the tokens of a run that has not begun; return them."""
-        self.program, self.values, self.dirty, self.origin, self.has_payload = (
-            program,
-            values,
-            dirty,
-            origin,
-            has_payload,
-        )
+        self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
+        self.origin = origin
         self.running, self.changed, self.side_by_side, self.durations_ns = -1, (), False, {}
         self.wanted = self._stale = None
         self.revisions = program.revisions() if program.revised else ()
@@ -175,8 +170,13 @@ class TokenManager(OldNames):
             self._mark(self.program.slots[token])
         return self
 
-    def store(self, step: Step, made: Sequence[Any]) -> None:
-        """Store what a step has made, guarded if the program is; the steps that read something new become dirty."""
+    def store(self, step: Step, made: Sequence[Any] | None) -> None:
+        """Store what a step has made, guarded if the program is; the steps that read something new become dirty.
+
+        None stands for a step that was skipped, since one of its inputs is Nothing: so are all its outputs.
+        """
+        if made is None:
+            self.program.has_skipped, made = True, [Nothing] * len(step.outputs)
         self.dirty[step.place] = 0
         if self.origin is None:
             for slot, value in zip(step.outputs, made, strict=True):
@@ -197,11 +197,6 @@ class TokenManager(OldNames):
         for place in program.consumers[slot]:
             if not program.switches or slot in program.read_by(program.steps[place], self.values):
                 self.dirty[place] = 1
-
-    def skip(self, step: Step) -> None:
-        """Store Nothing as all that a step makes, since one of its inputs is Nothing."""
-        self.program.has_skipped = True
-        self.store(step, [Nothing] * len(step.outputs))
 
     def forget(self, steps: Iterable[int]) -> None:
         """Make the outputs of these steps read as not computed."""

@@ -80,6 +80,8 @@ class RunReport(Displayed):
 
     Attributes
     ----------
+    program
+        What was run.
     total_ns
         From the start of the run to its end, in nanoseconds.
     side_by_side
@@ -88,28 +90,17 @@ class RunReport(Displayed):
         Nanoseconds by step that ran.
     """
 
-    __slots__ = ("_failed_at", "_program", "_skipped", "_wanted", "ran_ns", "side_by_side", "total_ns")
+    __slots__ = ("_failed_at", "_skipped", "_wanted", "program", "ran_ns", "side_by_side", "total_ns")
 
     def __init__(
-        self,
-        program: Program,
-        wanted: bytes | None,
-        durations_ns: Durations,
-        total_ns: int,
-        side_by_side: bool = False,
-        failed_at: int = -1,
-        skipped: Sequence[int] = (),
-    ) -> None:
-        self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
+        self, program: Program, wanted: bytes | None, durations_ns: Durations, total_ns: int,
+        side_by_side: bool = False, failed_at: int = -1, skipped: Sequence[int] = (),
+    ) -> None:  # fmt: skip
+        self.program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
         self._failed_at, self._skipped = failed_at, skipped
         if not isinstance(durations_ns, dict):
             durations_ns = {place: duration for place, duration in enumerate(durations_ns) if duration >= 0}
         self.ran_ns = durations_ns
-
-    @property
-    def program(self) -> Program:
-        """What was run."""
-        return self._program
 
     @property
     def functions(self) -> tuple[FunctionTime, ...]:
@@ -117,14 +108,14 @@ class RunReport(Displayed):
         ran_ns, wanted, failed_at, skipped = self.ran_ns, self._wanted, self._failed_at, frozenset(self._skipped)
         return tuple(
             FunctionTime(step.name, ran_ns.get(place, 0), place in ran_ns, place == failed_at, place in skipped)
-            for place, step in enumerate(self._program.steps)
+            for place, step in enumerate(self.program.steps)
             if wanted is None or wanted[place] or place in ran_ns
         )
 
     @property
     def durations_ns(self) -> dict[str, int]:
         """Nanoseconds by function that ran, in run order; of one that failed until it raised."""
-        return {self._program.steps[place].name: self.ran_ns[place] for place in sorted(self.ran_ns)}
+        return {self.program.steps[place].name: self.ran_ns[place] for place in sorted(self.ran_ns)}
 
     @property
     def ran(self) -> tuple[str, ...]:
@@ -134,12 +125,12 @@ class RunReport(Displayed):
     @property
     def is_whole(self) -> bool:
         """Whether every function of the graph ran, and none failed."""
-        return self._failed_at < 0 and len(self.ran_ns) == len(self._program.steps)
+        return self._failed_at < 0 and len(self.ran_ns) == len(self.program.steps)
 
     @property
     def failed(self) -> str | None:
         """The function that failed, or None."""
-        return None if self._failed_at < 0 else self._program.steps[self._failed_at].name
+        return None if self._failed_at < 0 else self.program.steps[self._failed_at].name
 
     @property
     def reused(self) -> tuple[str, ...]:
@@ -154,7 +145,7 @@ class RunReport(Displayed):
     @property
     def critical_path_ns(self) -> int:
         """The longest time that functions which need each other's outputs took one after another, in nanoseconds."""
-        return longest_path_ns(self._program, self.ran_ns)
+        return longest_path_ns(self.program, self.ran_ns)
 
     @property
     def overhead_ns(self) -> int:
@@ -312,11 +303,10 @@ class LogNormal:
             return math.nan
         if duration_ns <= 0:
             return 0.0
-        away = math.log(duration_ns) - self.mu
+        log = math.log(duration_ns)
         if self.sigma == 0:
-            return 0.0 if away else math.inf
-        scale = duration_ns * self.sigma * math.sqrt(2 * math.pi)
-        return math.exp(-((away / self.sigma) ** 2) / 2) / scale
+            return math.inf if log == self.mu else 0.0
+        return NormalDist(self.mu, self.sigma).pdf(log) / duration_ns
 
     def __repr__(self) -> str:
         if not self.is_fitted:
@@ -413,7 +403,8 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
             raise TypeError(f"summarize takes RunReports, such as runner.reports, not {kind!r}.")
     ended = [report for report in given if report.failed is None]
     if not ended:
-        raise ValueError(_all_failed(len(given)))
+        failed = "The only run has failed" if len(given) == 1 else f"All {len(given)} runs have failed"
+        raise ValueError(f"{failed}, so there are no times to summarize. runner.last.failure says why.")
     durations = _by_function(ended)
     return TimingSummary(
         functions=MappingProxyType({name: _fit(values) for name, values in durations.items() if values}),
@@ -423,11 +414,6 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
         side_by_side=any(report.side_by_side for report in ended),
         failed_runs=len(given) - len(ended),
     )
-
-
-def _all_failed(count: int) -> str:
-    failed = "The only run has failed" if count == 1 else f"All {count} runs have failed"
-    return f"{failed}, so there are no times to summarize. runner.last.failure says why."
 
 
 def _by_function(reports: Sequence[RunReport]) -> dict[str, list[int]]:
