@@ -51,6 +51,17 @@ class Run(TokenMapping):
     Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
     draw on a copy, ``run["edges"].copy()``. A payload array is not copied: if its owner fills it again, the run and its
     picture show what is in it then.
+
+    Attributes
+    ----------
+    tokens
+        The token store.
+    hparams
+        The hyperparameters with their versions.
+    times
+        What ``report`` is made of.
+    trial_of
+        Of a trial, the state of its runner when it began.
     """
 
     # What can be made of these is made when it is read: to record a run takes a good part of what EPypes adds to its
