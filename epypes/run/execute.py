@@ -211,10 +211,8 @@ class _Source:
         self._certain = bytes(tokens.begin().dirty)
         self._carried = tokens.origin or b""
         self._changed = {program.slots[token] for token in tokens.changed}
-        wanted, stale = (
-            tokens.wanted,
-            program.downstream((place for place, dirty in enumerate(self._certain) if dirty), ()),
-        )
+        wanted = tokens.wanted
+        stale = program.downstream((place for place, dirty in enumerate(self._certain) if dirty), ())
         self._steps = [program.steps[place] for place in sorted(stale) if wanted is None or wanted[place]]
         # Whether what is dirty depends on what steps make; if not, or if all steps run, it is known what is left.
         self._has_flags = not all(self._certain[place] for place in stale)

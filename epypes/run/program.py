@@ -238,7 +238,9 @@ class Program:
         return tuple(self.steps[place].name for place in sorted(places) if place >= 0)
 
     def __del__(self) -> None:
-        self.count_calls()
+        # What its last runs have called; nothing if it could not be made.
+        if getattr(self, "uncounted", None):
+            self.count_calls()
 
     def count_calls(self) -> None:
         """Have the nodes count the calls of the runs that have ended; done when a node is asked for them."""
