@@ -136,11 +136,11 @@ class Hyperparameters:
         """
         program, (base, free) = self.program, self._start or self._started()
         values = base.copy()
-        for token in payload:
+        for token, value in payload.items():
             slot = free.get(token)
             if slot is None:
                 raise self._wrong_payload(token)
-            value = values[slot] = payload[token]
+            values[slot] = value
             if type(value) not in COPIERS:
                 require_reusable(value, program, slot)
         if program.selectors:
