@@ -49,7 +49,7 @@ class Cases:
     def __init__(self, runner: Tunable, cases: Checks, history: History, tuning: Tuning) -> None:
         self._runner, self._tuning = runner, tuning
         self._cases = cases if any(checks for _, checks in cases) else ()
-        self._worker = Worker(tuning.report, "epypes-cases")
+        self._worker = Worker("epypes-cases", tuning.report)
         self._lock = threading.Lock()
         self._wanted: Mapping[str, Any] | None = None
         self._over = threading.Event()

@@ -7,6 +7,7 @@ but a probe, which reads a pixel of pictures that are there.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.cases import Cases
 from epypes_widgets.frames import scene
-from epypes_widgets.promotion import Outcome, ReportingJob, start_promotion, start_write_back
+from epypes_widgets.promotion import BundleJob, Outcome
 from epypes_widgets.screen import Comparison
 from epypes_widgets.search import Search
 from epypes_widgets.stages import probe
@@ -49,8 +50,7 @@ class Messages:
     ) -> None:
         self._tuning, self._screen, self._cases, self._search = tuning, tuning.screen, cases, search
         self._save, self._load = save, load
-        self._write_back, self._promotion = write_back, ReportingJob("epypes-promotion", self._promoted)
-        self._writing = ReportingJob("epypes-write-back", self._written)
+        self._write_back, self._bundle_job = write_back, BundleJob(self._show_outcome)
         if search is not None:
             search.report = lambda: self._screen.view.tell("optimised", search.content())
 
@@ -170,19 +170,18 @@ class Messages:
     def _promote(self, message: Message) -> None:
         runner, to = self._tuning.runner, str(message["to"])
         if isinstance(runner, CompGraphRunner):
-            start_promotion(self._promotion, runner, to)
+            self._bundle_job.promote(runner, to)
         else:
             text = "Not promoted: a running service is a bundle already. Write its values back."
-            self._promoted(Outcome("refused", text, to))
+            self._show_outcome(Outcome("promoted", "refused", text, to))
 
     def _start_write_back(self, message: Message) -> None:
         if self._tuning.session.is_service:
-            start_write_back(self._writing, self._write_back, dry_run=bool(message["dry_run"]))
+            self._bundle_job.write_back(self._write_back, dry_run=bool(message["dry_run"]))
         else:
-            self._written(Outcome("refused", "Not written: a runner has no bundle to write to. Promote it."))
+            text = "Not written: a runner has no bundle to write to. Promote it."
+            self._show_outcome(Outcome("written", "refused", text))
 
-    def _promoted(self, outcome: Outcome) -> None:
-        self._screen.view.tell("promoted", {"state": outcome.state, "text": outcome.text, "to": outcome.to})
-
-    def _written(self, outcome: Outcome) -> None:
-        self._screen.view.tell("written", {"state": outcome.state, "text": outcome.text, "diff": outcome.diff})
+    def _show_outcome(self, outcome: Outcome) -> None:
+        content = asdict(outcome)
+        self._screen.view.tell(content.pop("kind"), content)

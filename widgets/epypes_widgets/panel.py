@@ -85,7 +85,7 @@ class Panel:
         cg: CompGraph = self._runner.cg
         self._history = history_of(self._runner)
         self._column = column(cg, controls.controls)
-        self._worker = worker = Worker(self._report)
+        self._worker = worker = Worker(failed=self._report)
         view = PictureView(
             lambda key, request, delay_s: worker.post(key, request, delay_s, is_work=False), self._report
         )

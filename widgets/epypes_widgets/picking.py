@@ -77,7 +77,7 @@ class Picker:
         self._clicked: int | None = None
         self._text = ""
         self._is_seen = False
-        self._worker = Worker(self._failed, "epypes-pick")
+        self._worker = Worker("epypes-pick", self._failed)
         self._static = StaticOutput(lambda: sheet_page(self._sheet, self.chosen))
         self._view = SheetView()
         self._view.on_msg(self._answer)

@@ -24,18 +24,18 @@ class Worker:
 
     Parameters
     ----------
-    failed
-        Is called on the worker's thread with what a request has raised.
     name
         Of the thread.
+    failed
+        Is called on the worker's thread with what a request has raised; without, that is logged.
 
     Notes
     -----
     The thread is a daemon. It starts at the first request, and ends when there was none for a minute.
     """
 
-    def __init__(self, failed: Callable[[BaseException], None], name: str = "epypes-panel") -> None:
-        self._failed, self._name = failed, name
+    def __init__(self, name: str = "epypes-panel", failed: Callable[[BaseException], None] | None = None) -> None:
+        self._name, self._failed = name, failed or self._log
         self._condition = threading.Condition()
         self._closed = False
         self._running: str | None = None
@@ -101,7 +101,7 @@ class Worker:
             raise RuntimeError("A function of the graph can't wait for the panel that runs it.")
         with self._condition:
             if not self._condition.wait_for(self._is_done, timeout_s):
-                raise TimeoutError(f"The panel is still computing after {timeout_s:g} s. Wait longer.")
+                raise TimeoutError(f"{self._name} is still computing after {timeout_s:g} s. Wait longer.")
 
     def close(self, timeout_s: float) -> None:
         """Drop what waits and end the thread; may be called twice, and from any thread.
@@ -124,6 +124,9 @@ class Worker:
 
     def _is_done(self) -> bool:
         return self._running is None and not any(is_work for _, _, is_work in self._waiting.values())
+
+    def _log(self, error: BaseException) -> None:
+        _LOG.error("Work on the thread %s has failed", self._name, exc_info=error)
 
     def _work(self) -> None:
         while (request := self._next()) is not None:
