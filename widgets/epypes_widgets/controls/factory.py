@@ -8,7 +8,7 @@ from typing import Any
 from ipywidgets.widgets.widget_int import SliderStyle
 from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 
-from epypes.graph import CompGraph, as_switch
+from epypes.graph import CompGraph
 from epypes.hints import Param, Text
 from epypes_widgets.controls.control import (
     Appearance,
@@ -36,10 +36,7 @@ def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
         A hint is for no hyperparameter, can't be read, or does not fit: see ``ranges``.
     """
     cg, values, first = runner.cg, runner.hyperparameters, runner.first_hyperparameters
-    params = {
-        token: param if token in hints else _branches(cg, token, values[token]) or param
-        for token, param in ranges(runner, hints).items()
-    }
+    params = ranges(runner, hints)
     pairs = {scale.name: pair for pair in _pairs(params, values) for scale in pair}
     appearance = Appearance()
     made: dict[str, Control] = {}
@@ -79,13 +76,3 @@ def _single(cg: CompGraph, token: str, value: Any, param: Range, first: Any, app
     if along is not None:
         return SliderControl(along, value, first, appearance.of((token,), text, SliderStyle))
     return LineControl(token, value, param, first, appearance.of((token,), text, HTMLStyle))
-
-
-def _branches(cg: CompGraph, token: str, value: Any) -> Param | None:
-    """Return the branches that a selector chooses from, in each of its switches; None if it is no selector."""
-    consumers = [name for name in cg.digraph.consumers.get(token, ()) if cg.func_inputs(name)[0] == token]
-    switches = [switch for name in consumers if (switch := as_switch(cg.functions[name])) is not None]
-    if not switches:
-        return None
-    keys = tuple(key for key in switches[0].branches if all(key in other.branches for other in switches))
-    return Param(choices=keys) if choice_index(keys, value) is not None else None
