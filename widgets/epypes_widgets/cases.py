@@ -7,7 +7,7 @@ is given up.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from time import monotonic
@@ -19,8 +19,8 @@ from epypes.errors import EpypesError, PayloadError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 from epypes_widgets.history import Entry, History
-from epypes_widgets.images import Payload, payloads
-from epypes_widgets.target import Tunable
+from epypes_widgets.images import Payloads, payloads
+from epypes_widgets.session import Tunable
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import differing
 from epypes_widgets.worker import Worker
@@ -140,7 +140,7 @@ def _verdict(outcomes: tuple[CheckOutcome, ...] | None) -> dict[str, str]:
     return {"state": "failed", "text": f"{failures[0].check}: {failures[0].reason}"[:_TEXT_CHARACTERS] + more}
 
 
-def case_payloads(runner: Tunable, cases: Checks) -> Sequence[Payload]:
+def case_payloads(runner: Tunable, cases: Checks) -> Payloads:
     """Return the inputs of cases as what a panel can be switched to."""
     return payloads(runner, [case.inputs for case, _ in cases], [case.name or "" for case, _ in cases])
 

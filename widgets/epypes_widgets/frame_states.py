@@ -7,7 +7,7 @@ another frame runs those since the last checkpoint. They count as long as nothin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from time import monotonic
 from typing import Any, Final
@@ -18,7 +18,7 @@ from epypes.graph import subgraph
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import is_array, is_plain_array
 from epypes.run.program import INITIAL_STATE, REVISION
-from epypes_widgets.images import Payload
+from epypes_widgets.images import Payloads
 
 State = Mapping[str, Any]
 
@@ -90,7 +90,7 @@ class FrameStates:
         The tokens from which the state is taken.
     """
 
-    def __init__(self, runner: CompGraphRunner, payloads: Sequence[Payload]) -> None:
+    def __init__(self, runner: CompGraphRunner, payloads: Payloads) -> None:
         self._runner, self._payloads = runner, payloads
         cg = runner.cg
         self._initial: State = dict(CompGraphRunner(cg, runner.hyperparameters, guard=runner.guard).state)

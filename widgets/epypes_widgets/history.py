@@ -18,7 +18,7 @@ from epypes.display import Picture
 from epypes.optional import optional_import
 from epypes.store import Store, opened_store
 from epypes.store.writer import SeriesWriter
-from epypes_widgets.target import Tunable
+from epypes_widgets.session import Tunable
 from epypes_widgets.values import change_text, differing, json_value
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,14 +19,13 @@ from epypes_widgets.cases import Cases, case_payloads, read_cases
 from epypes_widgets.control_set import ControlSet
 from epypes_widgets.controls import column, controls
 from epypes_widgets.history import StoredHistory, history_of
-from epypes_widgets.images import Payload, VideoPayloads, payloads
+from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
 from epypes_widgets.search import Search, search_of
-from epypes_widgets.session import Session
+from epypes_widgets.session import Session, tunable
 from epypes_widgets.static import StaticOutput, static_html
-from epypes_widgets.target import tunable
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell
@@ -338,17 +337,20 @@ class Panel:
         if run is None:
             return ""
         first = self._runner.first_hyperparameters
-        return static_html(run, self.token, run.hyperparameters, first, image=self._session.title, code=self.code())
+        image = self._session.image
+        title = "" if image is None else self._session.payloads.title(image)
+        return static_html(run, self.token, run.hyperparameters, first, image=title, code=self.code())
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
-        frames, values = self._session.frames, json_values(self.values)
-        images = self._session.payloads if frames is None else ()
+        values, payloads = json_values(self.values), self._session.payloads
+        numbers = payloads.numbers
+        images = [payloads[index] for index in range(len(payloads))] if numbers is None else []
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
             "images": [{"index": index, "title": image.title} for index, image in enumerate(images)],
-            "frames": None if frames is None else {"name": self._session.frames_name, "numbers": _ends(frames)},
+            "frames": None if numbers is None else {"name": payloads.name, "numbers": _ends(numbers)},
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._controls.thresholds.items()],
             "rois": [
@@ -376,12 +378,6 @@ def _made_from(cg: CompGraph, token: str) -> list[str]:
         if found.intersection(cg.func_inputs(function)):
             found.update(cg.func_outputs(function))
     return sorted(found)
-
-
-def _searched(given: Sequence[Payload], *, is_series: bool) -> Any:
-    """Return the inputs that a search looks at, of a graph with state those of one case; None without any."""
-    inputs = given.video if isinstance(given, VideoPayloads) else [payload.values for payload in given]
-    return ([inputs] if is_series else inputs) if len(inputs) else None
 
 
 def tune(
@@ -473,17 +469,18 @@ def tune(
     if token is not None:
         runner.cg.require_token(token)
     found = read_cases(runner, images, cases)
-    given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
-    has_state = isinstance(runner, CompGraphRunner) and bool(runner.state)
+    given = case_payloads(runner, found) if found else Payloads() if images is None else payloads(runner, images)
     session = Session(runner, given)
-    if session.is_service and given:
+    if session.is_service and len(given):
         runner.trial({}, payload=given[0].values)  # refuses it
-    elif runner.last is None and not given and not session.is_service:
+    elif runner.last is None and not len(given) and not session.is_service:
         free = runner.free_source_tokens
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
     control_set = ControlSet(controls(runner, hints))
-    looked_at = [case for case, _ in found] or _searched(given, is_series=has_state)
+    looked_at: Any = [case for case, _ in found] or (given.inputs if len(given) else None)
+    if looked_at is not None and session.states is not None:
+        looked_at = [looked_at]  # the frames of one case
     search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
     session.begin()
     return Panel(control_set, session, token, found, store, name, search)

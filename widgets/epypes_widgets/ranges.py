@@ -20,7 +20,7 @@ from epypes.hints import Param, Roi, Text, as_param, param_from_value
 from epypes_widgets.values import as_python, is_integer, is_movable
 
 if TYPE_CHECKING:
-    from epypes_widgets.target import Tunable
+    from epypes_widgets.session import Tunable
 
 Range = Param | Roi | Text | None
 

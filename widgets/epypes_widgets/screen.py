@@ -14,9 +14,8 @@ from weakref import WeakKeyDictionary
 from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
-from epypes_widgets.session import Session
+from epypes_widgets.session import Session, Tunable
 from epypes_widgets.stages import Stage, best_stage, stages, states
-from epypes_widgets.target import Tunable
 from epypes_widgets.values import json_values
 from epypes_widgets.view import PictureView
 
@@ -241,8 +240,8 @@ class Screen:
     @property
     def _payload_shown(self) -> dict[str, Any]:
         """The index of the payload, and, of a frame of a video, its time in s."""
-        index, video = self._session.image_wanted, self._session.video
-        return {"image": index, "time_s": None if video is None or index is None else video.video.time_s(index)}
+        index = self._session.image_wanted
+        return {"image": index, "time_s": None if index is None else self._session.payloads.time_s(index)}
 
     @property
     def _pictures(self) -> set[str]:
@@ -267,7 +266,7 @@ class Screen:
         """Send the last entries; a thumbnail goes to a view once, and is empty from then on."""
         with self._listing:
             entries, current = self._history.entries, self._history.current
-            numbers = self._session.frames
+            numbers = self._session.payloads.numbers
             pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
             pairs = pairs if len(pairs) <= _MAX_ENTRIES else [pairs[0], *pairs[1 - _MAX_ENTRIES :]]

@@ -12,7 +12,7 @@ from epypes.errors import EpypesError, ScaleError
 from epypes.hints import Param
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
-from epypes_widgets.target import Tunable
+from epypes_widgets.session import Tunable
 from epypes_widgets.values import setting_text
 from epypes_widgets.worker import Worker
 

@@ -360,7 +360,7 @@ class Tuning:
 
     def _add(self, run: Run) -> None:
         current, image = self.history.current, self.session.image
-        if not self.session.payloads and current is not None:
+        if not len(self.session.payloads) and current is not None:
             image = current.image  # that of another panel on this runner
         token = self.screen.shown.token
         about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms}

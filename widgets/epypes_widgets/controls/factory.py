@@ -23,7 +23,7 @@ from epypes_widgets.controls.control import (
 )
 from epypes_widgets.controls.scale import Scale, scale
 from epypes_widgets.ranges import Range, ranges
-from epypes_widgets.target import Tunable
+from epypes_widgets.session import Tunable
 from epypes_widgets.tooltips import tooltip
 
 
