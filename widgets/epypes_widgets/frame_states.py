@@ -151,17 +151,21 @@ class FrameStates:
         for old in list(self._known)[:-_MOST_KEPT]:
             del self._known[old]
         place, state = known.nearest(frame)
-        first, reported_s = place, monotonic()
-        while place < frame:
-            if is_superseded():
-                raise Superseded
-            # A frame that can't be read leaves the state as it was, as one on which a function fails does.
-            with suppress(ImageFileError):
-                payload = self._payloads[place].values
-                state = self._runner.trial(values, *self.targets, payload=payload, state=state).state
-            place += 1
-            known.add(place, state)
-            if monotonic() - reported_s >= _REPORT_S:
-                report(f"Running the frames before this one: {place - first} of {frame - first}")
-                reported_s = monotonic()
+        first, begun_s, reports = place, monotonic(), 0
+        try:
+            while place < frame:
+                if is_superseded():
+                    raise Superseded
+                # A frame that can't be read leaves the state as it was, as one on which a function fails does.
+                with suppress(ImageFileError):
+                    payload = self._payloads[place].values
+                    state = self._runner.trial(values, *self.targets, payload=payload, state=state).state
+                place += 1
+                known.add(place, state)
+                if monotonic() - begun_s >= _REPORT_S * (reports + 1):
+                    reports += 1
+                    report(f"Running the frames before this one: {place - first} of {frame - first}")
+        finally:
+            if reports:
+                report("")
         return state

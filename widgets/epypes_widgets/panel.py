@@ -16,8 +16,9 @@ from epypes.run import CompGraphRunner, Run
 from epypes.store import Store
 from epypes_widgets import code, settings
 from epypes_widgets.cases import Cases, case_payloads, read_cases
+from epypes_widgets.column import column
 from epypes_widgets.control_set import ControlSet
-from epypes_widgets.controls import column, controls
+from epypes_widgets.controls import controls
 from epypes_widgets.history import StoredHistory, history_of
 from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
@@ -96,8 +97,7 @@ class Panel:
             self._stored = StoredHistory(self._runner, store, name, self._history, self._screen.log)
         self._tuning = Tuning(controls, session, self._history, worker, self._screen, self._static.update)
         self._cases = Cases(self._runner, cases, self._history, self._tuning)
-        messages = Messages(self._tuning, self._cases, self.save, self.load, self.write_back, search)
-        view.handlers = messages.handlers
+        view.handlers = Messages(self, self._tuning, self._cases).handlers
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         use_subshell(self._widget)
@@ -132,10 +132,7 @@ class Panel:
 
     def reset(self, /, *names: str) -> None:
         """Set hyperparameters to the values that the runner had them frozen with; all without names."""
-        first = self._runner.first_hyperparameters
-        for name in names:
-            self._controls.control(name)
-        self.set(**{name: first[name] for name in names or self.values if name in first})
+        self.set(**self._tuning.first_values(names))
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""

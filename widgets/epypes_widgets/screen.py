@@ -293,12 +293,13 @@ class Screen:
         self.verdicts = content
         self.view.tell("cases", content)
 
-    def log(self, text: str) -> None:
-        """Add a line to the log drawer."""
-        line = {"at": f"{datetime.now().astimezone():%H:%M:%S}", "text": text[:_LINE_CHARACTERS]}
+    def log(self, *texts: str) -> None:
+        """Add lines to the log drawer."""
+        at = f"{datetime.now().astimezone():%H:%M:%S}"
         with self._lock:
-            self._log = [*self._log, line][-_MAX_LINES:]
-        self.view.tell("log", {"lines": self._log})
+            self._log = [*self._log, *({"at": at, "text": text[:_LINE_CHARACTERS]} for text in texts)][-_MAX_LINES:]
+        if texts:
+            self.view.tell("log", {"lines": self._log})
 
     @property
     def lines(self) -> tuple[str, ...]:

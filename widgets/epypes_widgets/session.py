@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from operator import is_, is_not
+from operator import is_
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from epypes.run import CompGraphRunner, Run
@@ -76,10 +76,10 @@ class Session:
         # The runner's last run as of ``result``.
         self._followed: Run | None = None
         self._lock = threading.Lock()
+        self._is_closed = False
         self._wanted: dict[str, Any] = {}
         self._image_wanted: int | None = None
         self._seen = dict(runner.hyperparameters)
-        self._is_closed = False
         if isinstance(runner, CompGraphRunner) and runner.state and len(payloads):
             self.states = FrameStates(runner, self.payloads)
             # Cells may have run this frame with another state.
@@ -198,27 +198,34 @@ class Session:
         """
         with self._lock:
             wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
-        payload = None if image is None else self.payloads[image].values
         last = self.runner.last
         is_own = last is self._followed
-        present = self.image if is_own else None  # what a cell has run begins as it did there
+        frame = self.image if image is None and is_own else image  # what a cell has run begins as it did there
         begun: tuple[int, object] | None = None
-        if self.states is not None and (frame := present if image is None else image) is not None:
-            values = {**self.runner.hyperparameters, **wanted}
-            begun = frame, self.states.key(values)
+        if self.states is not None and frame is not None:
+            begun = frame, self.states.key({**self.runner.hyperparameters, **wanted})
         if self.states is not None and begun is not None and not (begun == self._begun and is_own):
             # So that the runner has the state after the frame, too.
             needed = (*targets, *self.states.targets) if targets else ()
             run = self.states.trial(begun[0], wanted, *needed, is_superseded=is_superseded, report=report)
         else:
-            payload = payload if begun is None else None
+            payload = self.payloads[image].values if image is not None and begun is None else None
             run = self.runner.trial(wanted, *targets, payload=payload)
         if run.failure is not None or self._is_closed:
             return run, True
         is_new = bool(wanted) or image is not None or bool(run.report.ran)
         if is_new and not self.runner.adopt(run):
             return run, False
-        self._settle(run, wanted, image)
+        with self._lock:
+            self.result = run
+            for name, value in wanted.items():
+                if self._wanted.get(name, self) is value:
+                    del self._wanted[name]
+                self._seen[name] = run.hyperparameters[name]
+            if image is not None or not is_own:
+                self.image = self._image_of(run) if image is None else image
+            if self._image_wanted == image:
+                self._image_wanted = None
         self._begun, self._followed = begun, run if is_new else last
         return run, True
 
@@ -249,20 +256,6 @@ class Session:
         if run is None or not len(self.payloads):
             return None
         return self.payloads.index_of({token: _value(run, token) for token in self.runner.free_source_tokens}, is_one)
-
-    def _settle(self, run: Run, wanted: Mapping[str, Any], image: int | None) -> None:
-        before = self.payload
-        with self._lock:
-            self.result = run
-            is_another = len(before) != len(self.payload) or any(map(is_not, before, self.payload))
-            for name, value in wanted.items():
-                if self._wanted.get(name, self) is value:
-                    del self._wanted[name]
-                self._seen[name] = run.hyperparameters[name]
-            if is_another:
-                self.image = self._image_of(run)
-            if self._image_wanted == image:
-                self._image_wanted = None
 
 
 def _value(run: Run, token: str) -> Any:

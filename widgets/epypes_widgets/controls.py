@@ -9,20 +9,25 @@ from __future__ import annotations
 import enum
 import html
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import ipywidgets
 from ipywidgets.widgets.widget_bool import CheckboxStyle
 from ipywidgets.widgets.widget_int import SliderStyle
+from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 
 from epypes.display.previews.short import short_repr
 from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text
-from epypes_widgets.controls.scale import Scale, exponent, refused, same_type
-from epypes_widgets.ranges import Range, allows
+from epypes_widgets.ranges import Range, allows, ranges
+from epypes_widgets.scale import Scale, exponent, refused, same_type, scale_of
+from epypes_widgets.tooltips import tooltip
 from epypes_widgets.values import is_same, numpy_type, sendable
+
+if TYPE_CHECKING:
+    from epypes_widgets.session import Tunable
 
 # A longer text is a document, not a parameter: it would travel with every message about its box.
 _MAX_TEXT: Final = 2_000
@@ -92,9 +97,12 @@ class Control:
         Whether all values are whole numbers.
     steps
         The distances between two values; None where there is none. On a logarithmic slider of exponents of ten.
+    tip
+        What is known of its hyperparameters, a line each.
     """
 
     integer = False
+    tip = ""
     steps: tuple[float | None, ...] = ()
 
     def __init__(
@@ -244,34 +252,36 @@ class SliderControl(Control):
         slider.value = place
 
 
-_Two = tuple[Any, Any]
-
-
 class RangeControl(Control):
     """A slider with two handles for two hyperparameters; the lower value never exceeds the upper one."""
 
-    def __init__(self, scales: tuple[Scale, Scale], values: _Two, first: _Two, appearance: Mapping[str, Any]) -> None:
-        low, high = scales
+    def __init__(
+        self,
+        scales: tuple[Scale, Scale],
+        values: tuple[Any, ...],
+        first: tuple[Any, ...],
+        appearance: Mapping[str, Any],
+    ) -> None:
+        low, high = self._scales = scales
         self.integer, self.steps = low.integer and high.integer, (low.step, high.step)
         slider = _IntRange if self.integer else _FloatRange
-        places = low.place(values[0]), high.place(values[1])
         ends = {"min": min(low.low, high.low), "max": max(low.high, high.high), "step": min(low.step, high.step)}
-        widget = slider(value=places, **ends, readout=False, continuous_update=False, **appearance)
-        self._slider, self._scales = widget, scales
-        self._places: tuple[float, float] = widget.value
-        self._snaps = _Snap(low, widget.step), _Snap(high, widget.step)
-        self._settle(values, widget.value)
-        super().__init__((low.name, high.name), (low.param, high.param), widget, first, "range")
+        places = low.place(values[0]), high.place(values[1])
+        self._slider = slider(value=places, **ends, readout=False, continuous_update=False, **appearance)
+        self._snaps = _Snap(low, self._slider.step), _Snap(high, self._slider.step)
+        self._places: tuple[float, ...] = ()
+        self._settle(values, self._slider.value)
+        super().__init__((low.name, high.name), (low.param, high.param), self._slider, first, "range")
 
     def _read(self) -> dict[str, Any]:
         places = self._slider.value
         if places != self._places:
             low, high = (snap.read(place) for snap, place in zip(self._snaps, places, strict=True))
-            self._places, self._values = places, self._ordered((low, high))
-        return {scale.name: value for scale, value in zip(self._scales, self._values, strict=True)}
+            self._places, self._values = places, self._ordered(low, high)
+        return {along.name: value for along, value in zip(self._scales, self._values, strict=True)}
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        found = {scale.name: scale.checked(values[scale.name]) for scale in self._scales if scale.name in values}
+        found = {along.name: along.checked(values[along.name]) for along in self._scales if along.name in values}
         low, high = {**self._read(), **found}.values()
         if low > high:
             below, above = self.names
@@ -294,26 +304,26 @@ class RangeControl(Control):
         self._settle((low, high), places)
         slider.value = places
 
-    def _settle(self, values: _Two, places: tuple[float, float]) -> None:
+    def _settle(self, values: tuple[Any, Any], places: tuple[float, float]) -> None:
         self._values, self._places = values, places
         for snap, value, place in zip(self._snaps, values, places, strict=True):
             snap.put(value, place)
 
-    def _ordered(self, new: _Two) -> _Two:
+    def _ordered(self, low: Any, high: Any) -> tuple[Any, Any]:
         """Return values in order: what was moved gives way to what was not.
 
         The handles are always in order. Their values need not be: each has a range, a type and exact values of its own.
         """
-        (low, high), (low_before, high_before) = new, self._values
+        low_before, high_before = self._values
         if low <= high:
-            return new
+            return low, high
         if is_same(high, high_before):
             low = self._scales[0].meant(high)
-            return (low, high) if low <= high else (low_before, high)
+            return (low if low <= high else low_before), high
         high = self._scales[1].meant(low)
         if low <= high:
             return low, high
-        return (low, high_before) if low <= high_before else self._values
+        return (low if low <= high_before else low_before), high_before
 
 
 # -- choices, texts and what is only shown --------------------------------------------------------------------------
@@ -395,11 +405,6 @@ def _label(choice: Any) -> str:
     return choice if isinstance(choice, str) and choice.strip() else short_repr(choice)
 
 
-def is_short_text(value: Any) -> bool:
-    """Whether a value is a text that a box can hold."""
-    return isinstance(value, str) and len(value) <= _MAX_TEXT
-
-
 class TextControl(Control):
     """A box of text, which commits on Enter or when it is left."""
 
@@ -454,3 +459,56 @@ class LineControl(Control):
             x, y, width, height = value
             return f"x {x}, y {y}, {width} x {height}"
         return html.escape(sendable(short_repr(value)))
+
+
+# -- of a runner ------------------------------------------------------------------------------------------------------
+
+
+def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
+    """Return the controls of a runner's hyperparameters, in graph order; a pair stands where its first token does.
+
+    Raises
+    ------
+    UnknownName, TypeError, ValueError
+        A hint is for no hyperparameter, can't be read, or does not fit: see ``ranges``.
+    """
+    values, first, params = runner.hyperparameters, runner.first_hyperparameters, ranges(runner, hints)
+    pairs = {along.name: pair for pair in _pairs(params, values) for along in pair}
+    appearance = Appearance()
+    made: dict[str, Control] = {}
+    for token, param in params.items():
+        if token in made:
+            continue
+        names = tuple(along.name for along in pairs[token]) if token in pairs else (token,)
+        tips = {name: tooltip(runner.cg, name, params[name]) for name in names}
+        if token in pairs:
+            text = "\n".join(f"{name}: {tip}" for name, tip in tips.items())
+            both, firsts = tuple(values[name] for name in names), tuple(first.get(name) for name in names)
+            control: Control = RangeControl(pairs[token], both, firsts, appearance.of(names, text, SliderStyle))
+        else:
+            control = _single(token, values[token], param, first.get(token), tips[token], appearance)
+        control.tip = "\n".join(tips.values())
+        made |= dict.fromkeys(names, control)
+    return tuple(dict.fromkeys(made.values()))
+
+
+def _pairs(params: Mapping[str, Range], values: Mapping[str, Any]) -> Iterator[tuple[Scale, Scale]]:
+    """Yield the scales of two tokens that one slider moves, the lower one first."""
+    for token, param in params.items():
+        above = params.get(param.below) if isinstance(param, Param) else None
+        if not isinstance(param, Param) or not isinstance(above, Param):
+            continue
+        low, high = scale_of(token, values[token], param), scale_of(param.below, values[param.below], above)
+        if low is not None and high is not None and not param.log and not above.log:
+            yield low, high
+
+
+def _single(token: str, value: Any, param: Range, first: Any, tip: str, appearance: Appearance) -> Control:
+    if isinstance(param, Text) and isinstance(value, str) and len(value) <= _MAX_TEXT:
+        return TextControl(token, value, param, first, appearance.of((token,), tip, TextStyle))
+    if isinstance(param, Param) and param.choices is not None and choice_index(param.choices, value) is not None:
+        return ChoiceControl(token, value, param, first, appearance, tip)
+    along = scale_of(token, value, param) if isinstance(param, Param) else None
+    if along is not None:
+        return SliderControl(along, value, first, appearance.of((token,), tip, SliderStyle))
+    return LineControl(token, value, param, first, appearance.of((token,), tip, HTMLStyle))

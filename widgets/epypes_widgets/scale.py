@@ -109,7 +109,7 @@ class Scale:
         return low, high
 
 
-def scale(name: str, value: Any, param: Param) -> Scale | None:
+def scale_of(name: str, value: Any, param: Param) -> Scale | None:
     """Return the scale of a hyperparameter; None if there is nothing to be moved, or no slider could do it."""
     if param.choices is not None or not is_number(value) or not allows(param, _item(value)):
         return None
