@@ -15,7 +15,7 @@ from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
 from epypes_widgets.session import Session, Tunable
-from epypes_widgets.stages import Stage, best_stage, stages, states
+from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
 from epypes_widgets.values import json_values
 from epypes_widgets.view import PictureView
 
@@ -80,12 +80,11 @@ class Shown:
         cut = self.cut if self.has_histogram else ()
         return tuple(dict.fromkeys(token for token in (self.token, self.other, *self.pinned, *cut) if token))
 
-    def within(self, stages: Sequence[Stage], run: Run) -> Shown:
+    def within(self, stages: Stages, run: Run) -> Shown:
         """Return what of this can be shown with these stages; another big picture if this one can't."""
-        known = {stage.token for stage in stages}
-        token = self.token if self.token in known else best_stage(run, stages)
-        pinned = tuple(name for name in self.pinned if name in known)
-        comparison = self.comparison if not self.other or self.other in known else None
+        token = self.token if self.token in stages else best_stage(run, stages)
+        pinned = tuple(name for name in self.pinned if name in stages)
+        comparison = self.comparison if not self.other or self.other in stages else None
         return replace(self, token=token, pinned=pinned, comparison=comparison)
 
 
@@ -136,7 +135,7 @@ class Screen:
         self.view = view
         before = _last_shown.get(session.runner, Shown())
         self.shown = Shown(asked or before.token, before.pinned, has_histogram=bool(cut), cut=cut)
-        self.stages: tuple[Stage, ...] = ()
+        self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
         self.listed = 0
@@ -162,11 +161,11 @@ class Screen:
         with self._lock:
             self.shown = _last_shown[self._session.runner] = replace(self.shown, **parts)
 
-    def require_stage(self, token: object) -> str:
+    def require_stage(self, token: str) -> str:
         """Return the token; LookupError if it is no stage."""
-        if not any(stage.token == token for stage in self.stages):
+        if token not in self.stages:
             raise LookupError(f"{token!r} has no picture here.")
-        return str(token)
+        return token
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
@@ -245,7 +244,7 @@ class Screen:
 
     @property
     def _pictures(self) -> set[str]:
-        return {stage.token for stage in self.stages if stage.is_picture}
+        return {token for token, is_picture in self.stages.items() if is_picture}
 
     # -- on any thread ------------------------------------------------------------------------------------------
 
@@ -254,7 +253,7 @@ class Screen:
         setup, buffers = self.setup()
         shown = self.shown
         setup |= {
-            "stages": [{"token": stage.token, "is_picture": stage.is_picture} for stage in self.stages],
+            "stages": [{"token": token, "is_picture": is_picture} for token, is_picture in self.stages.items()],
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
