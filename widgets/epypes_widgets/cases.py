@@ -109,16 +109,16 @@ class Cases:
         own = CompGraphRunner(self._runner.cg, values, guard=getattr(self._runner, "guard", True))
         done: dict[int, tuple[CheckOutcome, ...]] = {}
         reported_s = 0.0
-        screen.send_verdicts(self._content(done))
+        screen.tell("cases", self._content(done))
         for outcomes in run_checks(own, self._cases, has_pictures=False, stop=over):
             done[outcomes[0].number] = outcomes
             if monotonic() - reported_s >= _REPORT_S:
-                screen.send_verdicts(self._content(done))
+                screen.tell("cases", self._content(done))
                 reported_s = monotonic()
             while pending("compute") and not over.wait(_LOOK_S):
                 pass
         if not over.is_set():
-            screen.send_verdicts(self._content(done))
+            screen.tell("cases", self._content(done))
             self._result = CheckResult(tuple(outcome for number in sorted(done) for outcome in done[number]))
 
     def _content(self, done: Mapping[int, tuple[CheckOutcome, ...]]) -> dict[str, Any]:

@@ -142,16 +142,13 @@ class Screen:
         self._session, self._history, self._asked = session, history, asked
         self._lock = threading.Lock()
         self._seq = count(1).__next__
-        self._failure: dict[str, Any] = {}
-        self._note = {"text": "", "waits": False}
+        # The last message of each kind that a view which is mounted later must get again, with its bytes.
+        self._kept: dict[str, tuple[dict[str, Any], tuple[bytes, ...]]] = {}
         self._is_closed = False
-        self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
         # Held while the history is sent, so that what is sent last is the newest.
         self._listing = threading.Lock()
         self._pictured: set[int] = set()
-        self._log: list[dict[str, str]] = []
-        self.verdicts: dict[str, Any] | None = None
         self.change()
 
     # -- what is shown ------------------------------------------------------------------------------------------
@@ -184,28 +181,25 @@ class Screen:
         if shown.token is None:  # a graph may have no tokens
             return
         if failed is None:
-            self._failure, self.error = {}, ""
+            self.error = ""
+            self._kept.pop("error", None)
             if self._note["waits"]:
                 self.note("")
             self.compute_ms = run.report.total_ns / 1e6
-        frame = make_frame(
-            run,
-            shown.token,
-            self._seq(),
-            shown,
-            changed_ns,
-            self._pictures,
-            stale=failed is not None,
-            **self._payload_shown,
-            stages=states(failed or run, self.stages),
-        )
+        image = self._session.image_wanted
+        content = {
+            "stale": failed is not None,
+            "image": image,
+            "time_s": None if image is None else self._session.payloads.time_s(image),
+            "stages": states(failed or run, self.stages),
+        }
+        frame = make_frame(run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
         self.view.frames.offer(frame)
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
         """Say what failed, and where; the picture stays. An empty text ends that."""
         self.error = text = text[:_ERROR_CHARACTERS]
-        self._failure = {"seq": self._seq(), "text": text, "function": function, "names": list(names)}
-        self.view.tell("error", self._failure)
+        self.tell("error", {"seq": self._seq(), "text": text, "function": function, "names": list(names)})
 
     def note(self, text: str, *, waits: bool = False) -> None:
         """Say something that is no failure; it stays until another text, or none.
@@ -214,9 +208,13 @@ class Screen:
         """
         if waits and self.error:
             self.fail("")
-        if self._note != {"text": text, "waits": waits}:
-            self._note = {"text": text, "waits": waits}
-            self.view.tell("note", self._note)
+        content = {"text": text, "waits": waits}
+        if content != self._note:
+            self.tell("note", content)
+
+    @property
+    def _note(self) -> dict[str, Any]:
+        return self._kept["note"][0] if "note" in self._kept else {"text": "", "waits": False}
 
     def refers_to(self, key: object, payload: Sequence[Any]) -> bool:
         """Whether the picture is compared with this, computed from the very values of this payload."""
@@ -227,26 +225,25 @@ class Screen:
         """Show a token of another run to compare with."""
         self._referred = key, tuple(payload)
         described, data = picture(run, token, "other", had_pictures=self._pictures)
-        self._reference = {"seq": self._seq(), "label": label, "picture": described}, (data,) if data else ()
-        self.view.tell("reference", *self._reference)
+        content = {"seq": self._seq(), "label": label, "picture": described}
+        self.tell("reference", content, (data,) if data else ())
 
     def refer_anew(self, *, to_nothing: bool = False) -> None:
         """Have what the picture is compared with computed again; or compare with nothing, or another stage."""
         self._referred = (None, ())
         if to_nothing:
-            self._reference = None
-
-    @property
-    def _payload_shown(self) -> dict[str, Any]:
-        """The index of the payload, and, of a frame of a video, its time in s."""
-        index = self._session.image_wanted
-        return {"image": index, "time_s": None if index is None else self._session.payloads.time_s(index)}
+            self._kept.pop("reference", None)
 
     @property
     def _pictures(self) -> set[str]:
         return {token for token, is_picture in self.stages.items() if is_picture}
 
     # -- on any thread ------------------------------------------------------------------------------------------
+
+    def tell(self, kind: str, content: dict[str, Any], buffers: tuple[bytes, ...] = ()) -> None:
+        """Send a message, now and to each view that is mounted until the next one of its kind."""
+        self._kept[kind] = content, buffers
+        self.view.tell(kind, content, buffers)
 
     def send_setup(self) -> None:
         """Send all that a new view must know, but for the picture."""
@@ -287,23 +284,24 @@ class Screen:
             pictures = [b"" if each is None else each.data for each in new]
             self.view.tell("history", {"entries": content, **state}, pictures)
 
-    def send_verdicts(self, content: dict[str, Any]) -> None:
-        """Send which test images pass."""
-        self.verdicts = content
-        self.view.tell("cases", content)
-
     def log(self, *texts: str) -> None:
         """Add lines to the log drawer."""
+        if not texts:
+            return
         at = f"{datetime.now().astimezone():%H:%M:%S}"
-        with self._lock:
-            self._log = [*self._log, *({"at": at, "text": text[:_LINE_CHARACTERS]} for text in texts)][-_MAX_LINES:]
-        if texts:
-            self.view.tell("log", {"lines": self._log})
+        with self._lock:  # of two threads none loses the other's line
+            lines = [*self._lines, *({"at": at, "text": text[:_LINE_CHARACTERS]} for text in texts)][-_MAX_LINES:]
+            self._kept["log"] = {"lines": lines}, ()
+        self._tell_again("log")
 
     @property
     def lines(self) -> tuple[str, ...]:
         """What is in the log drawer."""
-        return tuple(f"{line['at']} {line['text']}" for line in self._log)
+        return tuple(f"{line['at']} {line['text']}" for line in self._lines)
+
+    @property
+    def _lines(self) -> list[dict[str, str]]:
+        return self._kept["log"][0]["lines"] if "log" in self._kept else []
 
     def close(self, text: str) -> None:
         """Say that values are not followed any more."""
@@ -319,14 +317,11 @@ class Screen:
             self._pictured.clear()
         self.send_setup()
         self.send_history()
-        if self.verdicts is not None:
-            self.view.tell("cases", self.verdicts)
-        if self._reference is not None:
-            self.view.tell("reference", *self._reference)
-        if self._log:
-            self.view.tell("log", {"lines": self._log})
+        self._tell_again("cases", "reference", "log")
         self.view.frames.ready()
-        if self._note["text"]:
-            self.view.tell("note", self._note)
-        if self._failure:
-            self.view.tell("error", self._failure)
+        self._tell_again("note", "error")
+
+    def _tell_again(self, *kinds: str) -> None:
+        for kind in kinds:
+            if (kept := self._kept.get(kind)) is not None:
+                self.view.tell(kind, *kept)
