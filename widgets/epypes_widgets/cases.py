@@ -18,7 +18,7 @@ from epypes.batch.items import items_of, payload_of, read_value
 from epypes.errors import EpypesError, PayloadError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
-from epypes_widgets.history import Entry, History
+from epypes_widgets.history import History
 from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.session import Tunable
 from epypes_widgets.tuning import Tuning
@@ -55,7 +55,7 @@ class Cases:
         self._over = threading.Event()
         self._has_left = False
         self._result: CheckResult | None = None
-        self._forget = history.watch(self._went_to)
+        self._forget = history.watch(lambda entry: self._want(entry.values))
 
     def begin(self) -> None:
         """Check with the values that the runner has, unless newer ones were committed."""
@@ -85,15 +85,13 @@ class Cases:
         self._over.set()
         self._worker.close(timeout_s)
 
-    def _went_to(self, entry: Entry) -> None:
+    def _want(self, committed: Mapping[str, Any]) -> None:
         now = self._runner.hyperparameters
-        self._want({**now, **{name: value for name, value in entry.values.items() if name in now}})
-
-    def _want(self, values: Mapping[str, Any]) -> None:
+        values = {name: committed.get(name, value) for name, value in now.items()}
         with self._lock:
             if self._wanted is not None and not differing(self._wanted, values):
                 return
-            self._wanted, self._result = dict(values), None
+            self._wanted, self._result = values, None
         self._request()
 
     def _request(self) -> None:

@@ -26,7 +26,7 @@ from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
 from epypes_widgets.search import Search, search_of
 from epypes_widgets.session import Session, tunable
-from epypes_widgets.static import StaticOutput, static_html
+from epypes_widgets.static import Displayed, StaticOutput, static_html
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from epypes_widgets.history_table import HistoryTable
 
 
-class Panel:
+class Panel(Displayed):
     """Controls and a picture, bound to a runner; made by ``tune``.
 
     Values may be set from any thread. They are computed on a thread of the panel's own, the latest first; a cell that
@@ -239,7 +239,7 @@ class Panel:
         SettingsError
             With every reason why not.
         """
-        return settings.save(path, self._controls.movable, self._runner.cg, self._controls.params)
+        return settings.save(path, self._controls.movable, self._controls.params)
 
     def load(self, path: str | Path) -> None:
         """Set the values that are in a TOML file, all or none.
@@ -318,16 +318,6 @@ class Panel:
             state = "computing"
         shows = "" if self.token is None else f", shows {self.token!r:.30}"
         return f"<Panel: {len(self.values)} hyperparameters{shows}; {state}>"
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
-        bundle: dict[str, Any] = self._widget._repr_mimebundle_() or {}
-        return {**bundle, "text/plain": repr(self)}
-
-    def _ipython_display_(self) -> None:
-        from IPython.display import display
-
-        display(self._repr_mimebundle_(), raw=True)
-        self._static.display()
 
     def _static_html(self) -> str:
         run = self._session.result

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
-from operator import is_
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
@@ -16,7 +15,7 @@ from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
 from epypes_widgets.session import Session, Tunable
 from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
-from epypes_widgets.values import json_values
+from epypes_widgets.values import is_same, json_values
 from epypes_widgets.view import PictureView
 
 _MAX_ENTRIES: Final = 40
@@ -218,8 +217,7 @@ class Screen:
 
     def refers_to(self, key: object, payload: Sequence[Any]) -> bool:
         """Whether the picture is compared with this, computed from the very values of this payload."""
-        before, values = self._referred
-        return before == key and len(values) == len(payload) and all(map(is_, values, payload))
+        return self._referred[0] == key and is_same(self._referred[1], tuple(payload))
 
     def refer(self, key: object, payload: Sequence[Any], label: str, run: Run, token: str) -> None:
         """Show a token of another run to compare with."""

@@ -15,7 +15,6 @@ from typing import Any, Final
 from epypes.bundle.settings import decode_value, encode_value, fits
 from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
-from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param
 from epypes.optional import optional_import
 from epypes_widgets.ranges import range_text
@@ -32,9 +31,7 @@ _MAX_REASONS: Final = 20
 _MEMBER: Final = "enum"
 
 
-def save(
-    path: str | Path, values: Mapping[str, Any], cg: CompGraph, params: Mapping[str, object] | None = None
-) -> Path:
+def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, object] | None = None) -> Path:
     """Write values as TOML, in one step: a file that was there is whole at every moment.
 
     Parameters
@@ -43,10 +40,8 @@ def save(
         The file; ``.toml`` is added if it is missing.
     values
         By hyperparameter.
-    cg
-        Its annotations give the ranges and units that stand beside the values.
     params
-        Hints that take their place, by hyperparameter.
+        By hyperparameter, the ranges and units that stand beside the values.
 
     Returns
     -------
@@ -62,8 +57,7 @@ def save(
     reasons = [reason for token, value in values.items() for reason in _unwritable(token, value)]
     if reasons:
         raise SettingsError(file, reasons)
-    hints = {token: next(annotated_params(cg, token), None) for token in values if token in cg.tokens}
-    text = _document(values, {**hints, **(params or {})})
+    text = _document(values, params or {})
     try:
         if file.is_file() and not _is_ours(file):
             raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
