@@ -331,13 +331,16 @@ class Panel(Displayed):
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
         values, payloads = json_values(self.values), self._session.payloads
-        numbers = payloads.numbers
+        numbers, frames = payloads.numbers, None
+        if numbers is not None:
+            counted = {"start": numbers.start, "step": numbers.step, "count": len(numbers)}
+            frames = {"name": payloads.name, "numbers": counted}
         images = [payloads[index] for index in range(len(payloads))] if numbers is None else []
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
             "images": [{"index": index, "title": image.title} for index, image in enumerate(images)],
-            "frames": None if numbers is None else {"name": payloads.name, "numbers": _ends(numbers)},
+            "frames": frames,
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._controls.thresholds.items()],
             "rois": [
@@ -351,11 +354,6 @@ class Panel(Displayed):
             "optimise": None if self.search is None else self.search.content(),
         }
         return content, [image.thumbnail for image in images]
-
-
-def _ends(numbers: range) -> dict[str, int]:
-    """Return the numbers of frames as the view gets them."""
-    return {"start": numbers.start, "step": numbers.step, "count": len(numbers)}
 
 
 def _made_from(cg: CompGraph, token: str) -> list[str]:
