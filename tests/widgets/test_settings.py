@@ -130,9 +130,7 @@ def test_values_that_can_not_be_written_are_all_named_and_nothing_is_written(tmp
 
 
 def test_a_missing_file_names_the_nearest_one(tmp_path: Path) -> None:
-    assert refused(tmp_path / "good", {}) == (
-        f"There is no file {tmp_path / 'good.toml'}. There are no settings in that folder.",
-    )
+    assert refused(tmp_path / "good", {}) == (f"No settings 'good' in {tmp_path}. There is none.",)
     save(tmp_path / "good", {"k": 1})
     assert refused(tmp_path / "goood.toml", {})[0].endswith("Did you mean 'good'?")
     assert refused(tmp_path / "other", {})[0].endswith("There are: good.")

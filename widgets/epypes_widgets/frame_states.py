@@ -12,11 +12,12 @@ from contextlib import suppress
 from time import monotonic
 from typing import Any, Final
 
+from epypes.batch.cache import NoDigest, value_digest
 from epypes.batch.grid import identity
 from epypes.errors import ImageFileError
 from epypes.graph import subgraph
 from epypes.run import CompGraphRunner, Run
-from epypes.run.guard import is_array, is_plain_array
+from epypes.run.guard import is_array
 from epypes.run.program import INITIAL_STATE, REVISION
 from epypes_widgets.images import Payloads
 
@@ -65,13 +66,10 @@ def _nbytes(state: State) -> int:
 
 def _identity(value: Any) -> object:
     """Return what is equal for values with which a function computes the same, as far as that can be seen."""
-    if is_plain_array(value) and not value.dtype.hasobject:
-        return value.shape, value.dtype, value.tobytes()
-    if type(value) in (list, tuple):
-        return type(value), *map(_identity, value)
-    if type(value) is dict:
-        return dict, *((key, _identity(item)) for key, item in value.items())
-    return identity(value)
+    try:
+        return value_digest(value)
+    except NoDigest:
+        return identity(value)
 
 
 class FrameStates:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import enum
 import os
 import secrets
@@ -194,7 +193,8 @@ def _entries(file: Path) -> dict[str, Any]:
             raise SettingsError(file, [f"{file} is no plain file of at most {_MAX_BYTES / 1e6:g} MB."])
         document = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
-        raise SettingsError(file, [_missing(file)]) from error
+        unknown = UnknownName("settings", file.name.removesuffix(_SUFFIX), names(file.parent), f"in {file.parent}")
+        raise SettingsError(file, [str(unknown)]) from error
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(file, [f"{file} is not TOML: {error}."]) from error
     except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text, and a zero byte in the name
@@ -205,16 +205,6 @@ def _entries(file: Path) -> dict[str, Any]:
         text = f"{file} has no settings of a panel: its format is {found_format!r:.40}, not {FORMAT!r}"
         raise SettingsError(file, [f"{text} with [{_SECTION}]."])
     return entries
-
-
-def _missing(file: Path) -> str:
-    known = names(file.parent)
-    near = difflib.get_close_matches(file.name.removesuffix(_SUFFIX), known, n=1, cutoff=0.6)
-    if near:
-        hint = f"Did you mean {near[0]!r}?"
-    else:
-        hint = f"There are: {', '.join(known[:12])}." if known else "There are no settings in that folder."
-    return f"There is no file {file}. {hint}"
 
 
 def _value(entry: Any, token: str, present: Any) -> Any:
