@@ -17,8 +17,7 @@ from epypes.store import Store
 from epypes_widgets import code, settings
 from epypes_widgets.cases import Cases, case_payloads, read_cases
 from epypes_widgets.column import column
-from epypes_widgets.control_set import ControlSet
-from epypes_widgets.controls import controls
+from epypes_widgets.controls import ControlSet, controls
 from epypes_widgets.history import StoredHistory, history_of
 from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages

@@ -16,7 +16,7 @@ from typing import Any, Final
 from epypes.errors import NotComputed, StillRunning
 from epypes.graph import subgraph
 from epypes.run import Failure, Run
-from epypes_widgets.control_set import ControlSet
+from epypes_widgets.controls import ControlSet
 from epypes_widgets.frame_states import Superseded
 from epypes_widgets.frames import thumbnail
 from epypes_widgets.history import Entry, History
