@@ -69,7 +69,6 @@ def _by_function(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[s
 
 def _row(control: Control, css: str, function: str) -> dict[str, Any]:
     ranges = [param if isinstance(param, Param) else Param() for param in control.params]
-    values = control.read()
     is_movable = control.kind != "shown"
     return {
         "css": css,
@@ -84,7 +83,6 @@ def _row(control: Control, css: str, function: str) -> dict[str, Any]:
         "high": [_end(param.high) for param in ranges],
         "step": list(control.steps) or [None] * len(ranges),
         "default": [json_value(value) if is_movable else None for value in control.first],
-        "value": [json_value(values[name]) if is_movable else None for name in control.names],
         "unit": ranges[0].unit,
         "tip": control.tip,
     }

@@ -10,7 +10,6 @@ import enum
 import html
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import ipywidgets
@@ -77,8 +76,7 @@ class Appearance:
 class Control:
     """One or two hyperparameters on screen; its methods may be called from any thread.
 
-    A subclass connects its values with its widget: by ``_read``, ``_checked`` and ``_place`` for values by
-    token, or ``_get``, ``_check`` and ``_put`` for the value of its one token.
+    A subclass connects the values by token with its widget.
 
     Attributes
     ----------
@@ -102,8 +100,10 @@ class Control:
     """
 
     integer = False
-    tip = ""
     steps: tuple[float | None, ...] = ()
+    tip = ""
+    # The trait of the widget that the user moves.
+    _trait = "value"
 
     def __init__(
         self, names: tuple[str, ...], params: tuple[Range, ...], widget: Any, first: tuple[Any, ...], kind: str
@@ -114,7 +114,7 @@ class Control:
         self._is_writing = False
         self._listeners: list[Callable[[Mapping[str, Any]], None]] = []
         self._reported = self._read()
-        widget.observe(self._moved, names="index" if kind == "choice" else "value")
+        widget.observe(self._moved, names=self._trait)
 
     def read(self) -> dict[str, Any]:
         """Return the values by token, to the last bit."""
@@ -168,23 +168,47 @@ class Control:
                 callback(moved)
 
     def _read(self) -> dict[str, Any]:
-        return {self.names[0]: self._get()}
+        raise NotImplementedError
+
+    def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def _place(self, values: Mapping[str, Any]) -> None:
+        raise NotImplementedError
+
+
+class SingleControl(Control):
+    """One hyperparameter: the value that was put counts to the last bit, until the user moves the widget.
+
+    A subclass has ``_check`` for a value, ``_shown_for`` for what the widget shows of it, and ``_meant`` for what the
+    user means by another thing that it shows.
+    """
+
+    def __init__(self, name: str, param: Range, widget: Any, value: Any, first: Any, kind: str) -> None:
+        self._exact, self._shown = value, getattr(widget, self._trait)
+        super().__init__((name,), (param,), widget, (first,), kind)
+
+    def _read(self) -> dict[str, Any]:
+        shown = getattr(self.widget, self._trait)
+        return {self.names[0]: self._exact if shown == self._shown else self._meant(shown)}
 
     def _checked(self, values: Mapping[str, Any]) -> dict[str, Any]:
         return {name: self._check(value) for name, value in values.items()}
 
     def _place(self, values: Mapping[str, Any]) -> None:
         for value in values.values():
-            self._put(value)
-
-    def _get(self) -> Any:
-        raise NotImplementedError
+            # First: a user that moves the widget at this very moment, on another thread, means a value of its own.
+            self._exact, self._shown = value, self._shown_for(value)
+            setattr(self.widget, self._trait, self._shown)
 
     def _check(self, value: Any) -> Any:
         raise NotImplementedError
 
-    def _put(self, value: Any) -> None:
+    def _shown_for(self, value: Any) -> Any:
         raise NotImplementedError
+
+    def _meant(self, shown: Any) -> Any:
+        return self._exact
 
 
 # -- sliders --------------------------------------------------------------------------------------------------------
@@ -217,7 +241,7 @@ class _Snap:
         return self._exact if place == self._snapped else self._scale.meant(place)
 
 
-class SliderControl(Control):
+class SliderControl(SingleControl):
     """A slider of whole numbers, of floats, or of exponents."""
 
     def __init__(self, scale: Scale, value: Any, first: Any, appearance: Mapping[str, Any]) -> None:
@@ -229,27 +253,26 @@ class SliderControl(Control):
         else:
             slider = _IntSlider if scale.integer else _FloatSlider
             widget = slider(value=scale.place(value), min=scale.low, max=scale.high, **common)
-        self._slider, self._scale, self._snap = widget, scale, _Snap(scale, scale.step)
+        self._scale, self._snap = scale, _Snap(scale, scale.step)
         self._snap.put(value, widget.value)
         self.integer, self.steps = scale.integer, (scale.step,)
-        super().__init__((scale.name,), (scale.param,), widget, (first,), "log" if scale.param.log else "slider")
+        super().__init__(scale.name, scale.param, widget, value, first, "log" if scale.param.log else "slider")
 
-    def _get(self) -> Any:
-        return self._snap.read(self._slider.value)
+    def _meant(self, shown: Any) -> Any:
+        return self._snap.read(shown)
 
     def _check(self, value: Any) -> Any:
         return self._scale.checked(value)
 
-    def _put(self, value: Any) -> None:
-        slider = self._slider
+    def _shown_for(self, value: Any) -> Any:
+        slider = self.widget
         # Only the soft range is offered at first; code may go to the ends of the hard one.
         slider.min, slider.max = self._scale.grown(slider.min, slider.max, value)
-        place: float = self._scale.place(value)
-        # A slider of exponents clamps to what its ends come to.
-        stands = min(max(place, 10.0**slider.min), 10.0**slider.max) if self._scale.param.log else place
-        # First: a user that moves the slider at this very moment, on another thread, means a position of its own.
-        self._snap.put(value, stands)
-        slider.value = place
+        place = self._scale.place(value)
+        if self._scale.param.log:  # a slider of exponents clamps to what its ends come to
+            place = min(max(place, 10.0**slider.min), 10.0**slider.max)
+        self._snap.put(value, place)
+        return place
 
 
 class RangeControl(Control):
@@ -329,45 +352,37 @@ class RangeControl(Control):
 # -- choices, texts and what is only shown --------------------------------------------------------------------------
 
 
-class ChoiceControl(Control):
+class ChoiceControl(SingleControl):
     """A checkbox for False and True, else a drop-down.
 
     The value is known by its index, since ipywidgets takes a choice of None for "nothing chosen", and 1 for True.
     """
 
     def __init__(self, name: str, value: Any, param: Param, first: Any, appearance: Appearance, tooltip: str) -> None:
-        choices = param.choices or ()
-        is_check = all(map(_is_truth, choices)) and sorted(choices) == [False, True]
+        self._choices, self._numpy_type = param.choices or (), numpy_type(value)
+        is_check = all(map(_is_truth, self._choices)) and sorted(self._choices) == [False, True]
         if is_check:
-            self._param = replace(param, choices=(False, True))
-            style = appearance.of((name,), tooltip, CheckboxStyle)
-            self._box: Any = ipywidgets.Checkbox(value=bool(value), **style)
+            self._choices = (False, True)
+            box: Any = ipywidgets.Checkbox(value=bool(value), **appearance.of((name,), tooltip, CheckboxStyle))
         else:
-            self._param = param
-            labels = [sendable(text) for text in param.labels or map(_label, choices)]
+            self._trait = "index"
+            labels = [sendable(text) for text in param.labels or map(_label, self._choices)]
             # The style of sliders has all that a drop-down's has, so it can be shared.
             style = appearance.of((name,), tooltip, SliderStyle)
-            self._box = ipywidgets.Dropdown(options=labels, index=choice_index(choices, value), **style)
-        self._trait = "value" if is_check else "index"
-        self._choices, self._numpy_type = self._param.choices or (), numpy_type(value)
-        self._exact, self._index = value, getattr(self._box, self._trait)
-        super().__init__((name,), (param,), self._box, (first,), "check" if is_check else "choice")
+            box = ipywidgets.Dropdown(options=labels, index=choice_index(self._choices, value), **style)
+        super().__init__(name, param, box, value, first, "check" if is_check else "choice")
 
-    def _get(self) -> Any:
-        index = getattr(self._box, self._trait)
-        if index is not None and index != self._index:
-            self._index, self._exact = index, self._typed(self._choices[index])
-        return self._exact
+    def _meant(self, shown: Any) -> Any:
+        return self._exact if shown is None else self._typed(self._choices[shown])
 
     def _check(self, value: Any) -> Any:
         index = choice_index(self._choices, value)
         if index is None:
-            raise refused(self.names[0], value, self._param)
+            raise refused(self.names[0], value, self.params[0])
         return self._typed(self._choices[index])
 
-    def _put(self, value: Any) -> None:
-        self._exact, self._index = value, choice_index(self._choices, value)
-        setattr(self._box, self._trait, self._index)
+    def _shown_for(self, value: Any) -> Any:
+        return choice_index(self._choices, value)
 
     def _typed(self, choice: Any) -> Any:
         """Return a choice; as a scalar of NumPy where the value was one and the choice is the same number as such."""
@@ -405,57 +420,53 @@ def _label(choice: Any) -> str:
     return choice if isinstance(choice, str) and choice.strip() else short_repr(choice)
 
 
-class TextControl(Control):
+class TextControl(SingleControl):
     """A box of text, which commits on Enter or when it is left."""
 
     def __init__(self, name: str, value: str, param: Text, first: Any, appearance: Mapping[str, Any]) -> None:
         # A box of one line drops the ends of lines as soon as the user types into it.
-        box = ipywidgets.Textarea if "\n" in value else ipywidgets.Text
-        self._box = box(value=sendable(value), continuous_update=False, **appearance)
-        self._exact, self._shown, self._typed = value, self._box.value, same_type(value)
-        super().__init__((name,), (param,), self._box, (first,), "text")
+        kind = ipywidgets.Textarea if "\n" in value else ipywidgets.Text
+        self._typed = same_type(value)
+        box = kind(value=sendable(value), continuous_update=False, **appearance)
+        super().__init__(name, param, box, value, first, "text")
 
-    def _get(self) -> Any:
-        text = self._box.value
-        return self._exact if text == self._shown else self._typed(text)
+    def _meant(self, shown: Any) -> Any:
+        return self._typed(shown)
 
     def _check(self, value: Any) -> Any:
         if not isinstance(value, str):
             raise refused(self.names[0], value, Text())
         return self._typed(value)
 
-    def _put(self, value: Any) -> None:
-        self._exact, self._shown = value, sendable(value)
-        self._box.value = self._shown
+    def _shown_for(self, value: Any) -> Any:
+        return sendable(value)
 
 
-class LineControl(Control):
+class LineControl(SingleControl):
     """A line that shows a value as text: a rectangle, which is moved on the picture, or what only code can set."""
 
     def __init__(self, name: str, value: Any, param: Range, first: Any, appearance: Mapping[str, Any]) -> None:
-        self._param, self._value = param, value
-        self._line = ipywidgets.HTML(value=self._text(value), **appearance)
-        self._line.add_class("epypes-read-only")
-        super().__init__((name,), (param,), self._line, (first,), "roi" if isinstance(param, Roi) else "shown")
-
-    def _get(self) -> Any:
-        return self._value
+        self.params = (param,)
+        line = ipywidgets.HTML(value=self._shown_for(value), **appearance)
+        line.add_class("epypes-read-only")
+        super().__init__(name, param, line, value, first, "roi" if isinstance(param, Roi) else "shown")
 
     def _check(self, value: Any) -> Any:
-        if isinstance(self._param, Roi):
-            if not allows(self._param, value):
+        (param,) = self.params
+        if param is None:
+            return value
+        if isinstance(param, Roi):
+            if not allows(param, value):
                 way_out = "Give (x, y, width, height) in whole pixels, none of them negative."
                 raise ValueError(f"{self.names[0]!r} can't be {short_repr(value)}: it is a rectangle. {way_out}")
-            return (list if isinstance(self._value, list) else tuple)(map(int, value))
-        if self._param is not None and not allows(self._param, value):
-            raise refused(self.names[0], value, self._param)
+            return (list if isinstance(self._exact, list) else tuple)(map(int, value))
+        if not allows(param, value):
+            raise refused(self.names[0], value, param)
         return value
 
-    def _put(self, value: Any) -> None:
-        self._value, self._line.value = value, self._text(value)
-
-    def _text(self, value: Any) -> str:
-        if isinstance(self._param, Roi) and allows(self._param, value):
+    def _shown_for(self, value: Any) -> Any:
+        (param,) = self.params
+        if isinstance(param, Roi) and allows(param, value):
             x, y, width, height = value
             return f"x {x}, y {y}, {width} x {height}"
         return html.escape(sendable(short_repr(value)))
