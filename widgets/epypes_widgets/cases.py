@@ -19,7 +19,6 @@ from epypes.errors import EpypesError, PayloadError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 from epypes_widgets.history import History
-from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.session import Tunable
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import differing
@@ -136,11 +135,6 @@ def _verdict(outcomes: tuple[CheckOutcome, ...] | None) -> dict[str, str]:
         return {"state": "passed", "text": f"{counted(len(outcomes), 'check')} passed"}
     more = f", and {counted(len(failures) - 1, 'check')} more" if len(failures) > 1 else ""
     return {"state": "failed", "text": f"{failures[0].check}: {failures[0].reason}"[:_TEXT_CHARACTERS] + more}
-
-
-def case_payloads(runner: Tunable, cases: Checks) -> Payloads:
-    """Return the inputs of cases as what a panel can be switched to."""
-    return payloads(runner, [case.inputs for case, _ in cases], [case.name or "" for case, _ in cases])
 
 
 def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:

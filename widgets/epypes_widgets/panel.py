@@ -15,7 +15,7 @@ from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
 from epypes.store import Store
 from epypes_widgets import code, settings
-from epypes_widgets.cases import Cases, case_payloads, read_cases
+from epypes_widgets.cases import Cases, read_cases
 from epypes_widgets.column import column
 from epypes_widgets.controls import ControlSet, controls
 from epypes_widgets.history import StoredHistory, history_of
@@ -23,7 +23,7 @@ from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
-from epypes_widgets.search import Search, search_of
+from epypes_widgets.search import Search
 from epypes_widgets.session import Session, tunable
 from epypes_widgets.static import Displayed, StaticOutput, static_html
 from epypes_widgets.tuning import Tuning
@@ -453,7 +453,10 @@ def tune(
     if token is not None:
         runner.cg.require_token(token)
     found = read_cases(runner, images, cases)
-    given = case_payloads(runner, found) if found else Payloads() if images is None else payloads(runner, images)
+    if found:
+        given = payloads(runner, [case.inputs for case, _ in found], [case.name or "" for case, _ in found])
+    else:
+        given = Payloads() if images is None else payloads(runner, images)
     session = Session(runner, given)
     if session.is_service and len(given):
         runner.trial({}, payload=given[0].values)  # refuses it
@@ -465,6 +468,6 @@ def tune(
     looked_at: Any = [case for case, _ in found] or (given.inputs if len(given) else None)
     if looked_at is not None and session.states is not None:
         looked_at = [looked_at]  # the frames of one case
-    search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
+    search = None if metric is None else Search(runner, metric, direction, looked_at, control_set.params)
     session.begin()
     return Panel(control_set, session, token, found, store, name, search)

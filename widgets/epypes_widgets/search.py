@@ -39,7 +39,12 @@ class Search:
     metric, direction, cases
         As for ``ep.optimize``; without cases, the payload of the last run is the one case.
     ranges
-        Returns what hyperparameters may be, by token; those vary that are choices, or numbers between two ends.
+        What hyperparameters may be, by token; those vary that are choices, or numbers between two ends.
+
+    Raises
+    ------
+    TypeError
+        It is a running service.
 
     Attributes
     ----------
@@ -51,16 +56,20 @@ class Search:
 
     def __init__(
         self,
-        runner: CompGraphRunner,
+        runner: Tunable,
         metric: Any,
         direction: Direction,
         cases: Any,
-        ranges: Callable[[], Mapping[str, Any]],
+        ranges: Mapping[str, Any],
     ) -> None:
+        if not isinstance(runner, CompGraphRunner):
+            text = "metric is for a runner: a running service has one image at a time. Optimise where it was made."
+            raise TypeError(text)
         self.result: OptimizeResult | None = None
         self.report: Callable[[], None] = lambda: None
         self._runner, self._metric, self._direction = runner, metric, direction
-        self._cases, self._ranges = cases, ranges
+        self._cases = cases
+        self._ranges = {name: param for name, param in ranges.items() if isinstance(param, Param)}
         self._worker = Worker("epypes-search")
         # Held while reporting, so that nothing older comes after something newer.
         self._reporting = threading.RLock()
@@ -154,7 +163,7 @@ class Search:
                 self._last_payload() if self._cases is None else self._cases,
                 self._n,
                 direction=self._direction,
-                ranges={name: param for name, param in self._ranges().items() if isinstance(param, Param)},
+                ranges=self._ranges,
                 stop=self._stop,
                 on_trial=self._tried,
                 progress=False,
@@ -192,16 +201,3 @@ class Search:
             self.report()
         except Exception:
             _LOG.exception("How far a search has come could not be shown")
-
-
-def search_of(
-    runner: Tunable, metric: Any, direction: Direction, cases: Any, ranges: Callable[[], Mapping[str, Any]]
-) -> Search | None:
-    """Return the search of a runner's hyperparameters; None without a metric, TypeError for a running service."""
-    if metric is None:
-        return None
-    if not isinstance(runner, CompGraphRunner):
-        raise TypeError(
-            "metric is for a runner: a running service has one image at a time. Optimise where it was made."
-        )
-    return Search(runner, metric, direction, cases, ranges)
