@@ -196,6 +196,14 @@ def test_a_value_outside_of_the_soft_range_is_offered_from_the_beginning() -> No
     assert made(60, ep.Param(0, 100, soft=(0, 10))).widget.max == 60
 
 
+def test_a_choice_that_is_gone_back_to_is_the_value_that_was_there() -> None:
+    entry = made(1.0, [0, 1, 2])
+    told = moves(entry)
+    entry.widget.index = 2
+    entry.widget.index = 1
+    assert [(values["x"], type(values["x"])) for values in told] == [(2, int), (1.0, float)]
+
+
 def test_named_choices_are_shown_by_name_and_two_may_have_one_value() -> None:
     entry = made(1, ep.Param(choices=(0, 1, 1, 2), labels=("NEAREST", "LINEAR", "BILINEAR", "CUBIC")))
     assert entry.widget.options == ("NEAREST", "LINEAR", "BILINEAR", "CUBIC")

@@ -13,6 +13,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import SettingsError
+from epypes_widgets import tune
 from epypes_widgets.settings import load, names, save
 
 
@@ -79,6 +80,17 @@ def test_a_file_can_be_read_and_edited_by_a_person(tmp_path: Path) -> None:
     ]
     file.write_text(file.read_text().replace("side = 5", "side = 7"))
     assert load(file, {"side": 5, "lo": (1, 2)}) == {"side": 7, "lo": (1, 2)}
+
+
+def test_the_file_of_a_panel_has_the_ranges_and_units_of_annotations(tmp_path: Path) -> None:
+    def smooth(image: Any, side: Annotated[int, ep.Param(1, 31, odd=True, unit="px")]) -> Any:
+        return image
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"smooth": smooth}, {"smooth": (("im", "k"), "s")}), {"k": 5})
+    runner.run(im=np.zeros((8, 8), np.uint8))
+    panel = tune(runner)
+    assert "k = 5 # odd 1 to 31 px" in panel.save(tmp_path / "good").read_text()
+    panel.close(60)
 
 
 def test_a_hint_that_is_no_range_is_passed_over(tmp_path: Path) -> None:

@@ -260,28 +260,21 @@ def _paired(runner: Tunable, found: Mapping[str, Range], given: Mapping[str, Ran
     neither has a hint, their names or those of their parameters differ by low and high, and their values are of one
     type and in order.
     """
-    ranges, values = dict(found), runner.hyperparameters
+    values = runner.hyperparameters
+    ranges = {token: replace(param, below="") if isinstance(param, Param) else param for token, param in found.items()}
+    declared = [(token, param.below) for token, param in found.items() if isinstance(param, Param) and param.below]
     taken: set[str] = set()
-
-    def take(low: str, high: str) -> bool:
-        fits = low != high and not {low, high} & taken and _is_pair(values, low, high, ranges)
-        taken.update((low, high) if fits else ())
-        return fits
-
-    for token, param in found.items():
-        if not isinstance(param, Param) or not param.below or take(token, param.below):
-            continue
-        if token in given:
-            raise ValueError(
-                f"{token!r} ({values[token]!r:.60}) is hinted to stay below {param.below!r} "
-                f"({values[param.below]!r:.60}). Both must be numbers of one type, in order, and in no other pair. "
-                "Set them so, or leave below out."
-            )
-        ranges[token] = replace(param, below="")
-    for low, high in _named_pairs(runner, [token for token in ranges if token not in given]):
+    for low, high in (*declared, *_named_pairs(runner, [token for token in ranges if token not in given])):
         param = ranges[low]
-        if isinstance(param, Param) and take(low, high):
+        is_free = low != high and not {low, high} & taken
+        if isinstance(param, Param) and is_free and _is_pair(values, low, high, ranges):
+            taken |= {low, high}
             ranges[low] = replace(param, below=high)
+        elif low in given:
+            raise ValueError(
+                f"{low!r} ({values[low]!r:.60}) is hinted to stay below {high!r} ({values[high]!r:.60}). Both must be "
+                "numbers of one type, in order, and in no other pair. Set them so, or leave below out."
+            )
     return ranges
 
 
