@@ -74,7 +74,7 @@ class Session:
         # The frame of ``result`` and the key of the state that it began with.
         self._begun: tuple[int, object] | None = None
         # The runner's last run as of ``result``.
-        self._followed: Run | None = None
+        self._followed = runner.last
         self._lock = threading.Lock()
         self._is_closed = False
         self._wanted: dict[str, Any] = {}
