@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from operator import is_
+from operator import is_, is_not
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from epypes.run import CompGraphRunner, Run
@@ -74,7 +74,7 @@ class Session:
         # The frame of ``result`` and the key of the state that it began with.
         self._begun: tuple[int, object] | None = None
         # The runner's last run as of ``result``.
-        self._followed = runner.last
+        self._followed: Run | None = None
         self._lock = threading.Lock()
         self._is_closed = False
         self._wanted: dict[str, Any] = {}
@@ -216,14 +216,17 @@ class Session:
         is_new = bool(wanted) or image is not None or bool(run.report.ran)
         if is_new and not self.runner.adopt(run):
             return run, False
+        before = self.payload
         with self._lock:
             self.result = run
             for name, value in wanted.items():
                 if self._wanted.get(name, self) is value:
                     del self._wanted[name]
                 self._seen[name] = run.hyperparameters[name]
-            if image is not None or not is_own:
-                self.image = self._image_of(run) if image is None else image
+            if image is not None:
+                self.image = image
+            elif len(before) != len(self.payload) or any(map(is_not, before, self.payload)):
+                self.image = self._image_of(run)
             if self._image_wanted == image:
                 self._image_wanted = None
         self._begun, self._followed = begun, run if is_new else last
