@@ -181,6 +181,20 @@ def test_an_even_number_is_refused_where_only_odd_ones_are_taken() -> None:
         entry.write({"x": 12})
 
 
+@pytest.mark.parametrize(
+    ("value", "hint", "kind"),
+    [
+        (1.7e308, ep.Param(1.0, 1.7e308, log=True), "log"),
+        (1e308, (0.0, 1.7e308), "slider"),
+        (1e308, ep.Param(soft=(1e307, 1.7e308)), "slider"),
+        (5, ep.Param(0, soft=(5, 5)), "slider"),
+        (5.0, ep.Param(0.0, soft=(0.0, math.inf)), "slider"),
+    ],
+)
+def test_a_number_near_the_greatest_or_in_an_open_range_has_a_slider(value: Any, hint: Any, kind: str) -> None:
+    assert made(value, hint).kind == kind
+
+
 def test_a_slider_that_is_stretched_keeps_its_places() -> None:
     entry = made(32, ep.Param(0, 1000, 16, soft=(16, 64)))
     entry.write({"x": 100})

@@ -99,16 +99,18 @@ def _closed(param: Range, value: Any) -> Range:
     """
     if not isinstance(param, Param) or param.choices is not None:
         return param
-    number = as_python(value)
-    around = param_from_value(number) if is_movable(value) else None
-    if around is None or around.low is None or around.high is None:
+    if not is_movable(value):
         return None
+    number = as_python(value)
     low, high = (min(param.soft[0], number), max(param.soft[1], number)) if param.soft else (number, number)
     if low < high and math.isfinite(low) and math.isfinite(high):
         return replace(param, soft=(low, high))
     low, high = (None if end is None or math.isinf(end) else end for end in (param.low, param.high))
     if low is not None and high is not None:
         return replace(param, soft=None)
+    around = param_from_value(number)
+    if around is None or around.low is None or around.high is None:
+        return None
     if low is None:
         low = around.low if high is None else min(around.low, high)
     if high is None:
