@@ -46,7 +46,7 @@ from typing import Any, Final
 
 from epypes.acquisition.files import is_video_name
 from epypes.acquisition.video import Video, VideoFrame
-from epypes.batch.items import by_frame, defensive_copy, holds_its_arrays, is_file, is_one_image, read_value
+from epypes.batch.items import VideoInput, defensive_copy, holds_its_arrays, is_file, is_one_image, opened, read_value
 from epypes.batch.metrics import METRICS
 from epypes.batch.results import short_text
 from epypes.bundle.settings import decode_value
@@ -234,12 +234,13 @@ def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
 
 def _by_frame(case: Case) -> Iterator[Case]:
     """Yield a case, or, of one with a video, a case for each frame."""
-    for inputs in by_frame(case.inputs):
-        if inputs is case.inputs:
-            yield case
-        else:
-            frame = next(value for value in _values(inputs) if isinstance(value, VideoFrame))
-            yield replace(case, inputs=inputs, name=f"{case.name} #{frame.number}" if case.name else frame.name)
+    given = opened(case.inputs)
+    if not isinstance(given, VideoInput):
+        yield case
+        return
+    for inputs in given:
+        frame = next(value for value in _values(inputs) if isinstance(value, VideoFrame))
+        yield replace(case, inputs=inputs, name=f"{case.name} #{frame.number}" if case.name else frame.name)
 
 
 def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:

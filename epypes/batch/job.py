@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from time import perf_counter_ns
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from epypes.acquisition.video import VideoFrame
 from epypes.batch.items import Item, frames_of, payload_of, read_value
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
-from epypes.errors import EpypesError, ScaleError
+from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
@@ -73,41 +74,32 @@ def run_job(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool] = lam
 
 def _run_with_state(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool]) -> Iterator[Outcome]:
     """Run the item, or its frames one after another, from the beginning for each setting; give the last outcomes."""
-    for place, setting in enumerate(job.settings):
-        outcome = _outcome_with_state(runner, job, setting, job.states[place] if job.states else {}, is_over)
-        if outcome is None:
-            return
-        yield outcome
-
-
-def _outcome_with_state(
-    runner: CompGraphRunner, job: Job, setting: Setting, state: State, is_over: Callable[[], bool]
-) -> Outcome | None:
-    item, total_ns, last = job.item, 0, None
-    try:
-        for place, frame in enumerate(frames_of(item, runner)):
-            if is_over():
-                return None
-            last = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
-            total_ns += last.report.total_ns
-            state = last.state
-            if last.failure is not None:
-                if not isinstance(last.failure.exception, Exception | SystemExit):  # Ctrl+C ends the map
-                    raise last.failure.exception
-                where = "" if item.frames is None else f" (frame {place}: {frame.name})"
-                return _outcome_of(last, job, setting, Album(), total_ns, state, where)
-        if last is None:
-            raise ScaleError(f"{item.name} has no frames. Give one at least.")
-    except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
-        (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
-        return replace(failed, state=state)
-    return _outcome_of(last, job, setting, Album(), total_ns, state)
+    item = job.item
+    for setting, state in zip_longest(job.settings, job.states, fillvalue=NO_SETTING):
+        total_ns, where = 0, ""
+        try:
+            for place, frame in enumerate(frames_of(item, runner)):
+                if is_over():
+                    return
+                run = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
+                total_ns, state = total_ns + run.report.total_ns, run.state
+                if run.failure is not None:
+                    where = "" if item.frames is None else f" (frame {place}: {frame.name})"
+                    break
+        except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
+            yield replace(failed_outcome(item, setting, error_info_of(error)), state=state)
+            continue
+        if run.failure is not None and not isinstance(run.failure.exception, Exception | SystemExit):
+            raise run.failure.exception  # Ctrl+C ends the map
+        yield _outcome_of(run, job, setting, Album(), total_ns, state, where)
 
 
 def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
-    item, start, now = job.item, job.start or SharedStart(), runner.hyperparameters
+    """Run the item with the first setting, then only what depends on what changes from setting to setting."""
+    item, start, now = job.item, job.start, runner.hyperparameters
     # A setting may leave out what another one has: that is then as it was.
     varied = {token: now[token] for setting in job.settings for token in setting if token in now}
+    album = start.album if start is not None else Album()
     waiting, begun = iter(job.settings), list[Outcome]()
 
     def begin() -> CompGraphRunner | None:
@@ -116,77 +108,25 @@ def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
         try:
             payload = payload_of(item, runner.cg)
         except (EpypesError, OSError) as error:
-            begun.extend(failed_outcomes(item, waiting, ErrorInfo("", type(error).__name__, str(error))))
+            begun.extend(failed_outcome(item, setting, error_info_of(error)) for setting in waiting)
             return None
         for setting in waiting:
-            begun.append(_outcome(runner, job, setting, varied, payload, start.album))
+            begun.append(_outcome(runner, job, setting, varied, payload, album))
             if runner.last is not before:
                 return runner
         return None
 
     try:
-        own = begin() if job.start is None else start.branch(begin)
+        own = begin() if start is None else start.branch(begin)
         yield from begun
         if own is not None:
             for setting in waiting:
-                yield _outcome(own, job, setting, varied, None, start.album)
-            if job.start is not None:
+                yield _outcome(own, job, setting, varied, None, album)
+            if start is not None:
                 start.move_to(own)
     finally:
         if varied:
             runner.set(**varied)
-
-
-def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorInfo) -> list[Outcome]:
-    """Return the outcomes of an item that could not be run, for each of its settings."""
-    return [_blank(item, setting, error_info) for setting in settings]
-
-
-def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:
-    """Return a job with the pixels of its frames of a video, for an executor: this thread decodes them, in order.
-
-    So a video is decoded once, without seeking, and worker processes need neither the file nor its codec.
-
-    Parameters
-    ----------
-    job, cg
-        The job, and the graph, which has the order of colours.
-    of_cases
-        Whether the frames that are run in the place of the item are read, too: they are then in memory together.
-
-    Raises
-    ------
-    ImageFileError
-        A frame is damaged.
-    """
-    item = _with_pixels(job.item, cg)
-    if of_cases and isinstance(item.frames, tuple):
-        item = replace(item, frames=tuple(_with_pixels(frame, cg) for frame in item.frames))
-    return job if item is job.item else replace(job, item=item)
-
-
-def _with_pixels(item: Item, cg: CompGraph) -> Item:
-    if not any(isinstance(value, VideoFrame) for value in item.payload.values()):
-        return item
-    read = {
-        token: read_value(value, cg, token) if isinstance(value, VideoFrame) else value
-        for token, value in item.payload.items()
-    }
-    return replace(item, payload=read)
-
-
-def _blank(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
-    """Return the outcome of an item that has no values."""
-    return Outcome(
-        item.number,
-        item.name,
-        setting,
-        total_ns=total_ns,
-        error_info=error_info,
-        frame=item.frame,
-        time_s=item.time_s,
-        series=item.series,
-    )
 
 
 def _outcome(
@@ -198,7 +138,7 @@ def _outcome(
     album: Album,
 ) -> Outcome:
     """Run a job's item with a setting, on a payload or on the last one, and return its outcome."""
-    item, values = job.item, {**varied, **setting}
+    values = {**varied, **setting}
     before, start_ns = runner.last, perf_counter_ns()
     try:
         if payload is None:
@@ -209,8 +149,7 @@ def _outcome(
             run = runner.run_on(payload, job.targets)
     except (Exception, SystemExit) as error:  # whatever a function raises
         if runner.last is None or runner.last is before:
-            info = ErrorInfo("", type(error).__name__, str(error))
-            return _blank(item, setting, info, perf_counter_ns() - start_ns)
+            return failed_outcome(job.item, setting, error_info_of(error), perf_counter_ns() - start_ns)
         run = runner.last
     return _outcome_of(run, job, setting, album)
 
@@ -230,25 +169,71 @@ def _outcome_of(
         Is added to the message of a failure.
     """
     item, report, tokens, failure = job.item, run.report, run.tokens, run.failure
-    sinks = [token for token in run.cg.sink_tokens if tokens.is_readable(token)]
+    values, nothing = dict[str, Any](), []
+    for token in run.cg.sink_tokens:
+        if tokens.is_readable(token):
+            if tokens.is_nothing(token):
+                nothing.append(token)
+            else:
+                values[token] = short_value(run[token])
     thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
         item.number,
         item.name,
         setting,
-        {token: short_value(run[token]) for token in sinks if not tokens.is_nothing(token)},
+        values,
         report.durations_ns,
         total_ns or report.total_ns,
         None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
-        nothing=tuple(filter(tokens.is_nothing, sinks)),
-        series=item.series,
-        state=state,
-        frame=item.frame,
-        time_s=item.time_s,
+        tuple(nothing),
+        item.frame,
+        item.time_s,
+        item.series,
+        state,
     )
+
+
+def failed_outcome(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
+    """Return the outcome of an item that could not be run with a setting, so that it has no values."""
+    outcome = Outcome(item.number, item.name, setting, total_ns=total_ns, error_info=error_info)
+    return replace(outcome, frame=item.frame, time_s=item.time_s, series=item.series)
+
+
+def error_info_of(error: BaseException) -> ErrorInfo:
+    """Return what failed where no function of the graph did."""
+    return ErrorInfo("", type(error).__name__, str(error))
+
+
+def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:
+    """Return a job with the pixels of its frames of a video, for an executor: this thread decodes them, in order.
+
+    So a video is decoded once, without seeking, and worker processes need neither the file nor its codec.
+
+    Parameters
+    ----------
+    job, cg
+        The job, and the graph, which has the order of colours.
+    of_cases
+        Whether the frames that are run in the place of the item are read, too: they are then in memory together.
+
+    Raises
+    ------
+    ImageFileError
+        A frame is damaged.
+    """
+
+    def with_pixels(item: Item) -> Item:
+        frames = {token: value for token, value in item.payload.items() if isinstance(value, VideoFrame)}
+        read = {token: read_value(frame, cg, token) for token, frame in frames.items()}
+        return replace(item, payload={**item.payload, **read}) if read else item
+
+    item = with_pixels(job.item)
+    if of_cases and isinstance(item.frames, tuple):
+        item = replace(item, frames=tuple(map(with_pixels, item.frames)))
+    return job if item is job.item else replace(job, item=item)
 
 
 class SharedStart:

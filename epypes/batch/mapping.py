@@ -5,31 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.acquisition.video import Video
 from epypes.batch.cache import OutcomeCache, outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
-from epypes.batch.items import (
-    FileSet,
-    Item,
-    SeriesKeys,
-    count_of,
-    detached_runner,
-    holds_its_arrays,
-    image_set,
-    items_of,
-    with_series,
-)
+from epypes.batch.items import ImageSet, Item, SeriesKeys, detached_runner, image_set, items_of, with_series
 from epypes.batch.job import NO_SETTING, Job, SharedStart, State
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import Outcome, OutcomeSequence, fixed_columns, outcomes_frame, outcomes_html
-from epypes.batch.series import Done, SeriesRuns, in_parts, whole_series
+from epypes.batch.series import Done, SeriesRuns, whole_series
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -355,31 +344,35 @@ class _Batch:
     """What is run on which images; ``settings`` are in the order in which they are run."""
 
     runner: CompGraphRunner
-    images: Any
+    images: ImageSet
     series: SeriesKeys | None
     settings: tuple[Setting, ...]
     executor: Executor | None
     kept: tuple[str, ...]
     shown: tuple[str, ...] | None
-    is_sweep: bool
+    cache: OutcomeCache | None
+    take: Callable[[Sequence[Outcome]], None]
 
     def items(self) -> Iterator[Item]:
-        for item in with_series(items_of(self.images, self.runner), self.series):
-            # How many a generator gives is known when it gives them; a map may be of any number.
-            if self.is_sweep:
-                _require_room(self.runner, self.settings, self.shown, item.number + 1)
+        items = with_series(items_of(self.images, self.runner), self.series)
+        return items if self.images.count is not None or self.settings[0] is NO_SETTING else self._counted(items)
+
+    def _counted(self, items: Iterator[Item]) -> Iterator[Item]:
+        """Yield items as long as the outcomes of a sweep can be held: how many there are is known when they come."""
+        for item in items:
+            _require_room(self.runner, self.settings, self.shown, item.number + 1)
             yield item
             # This generator waits for its caller, and must not keep the item alive meanwhile.
             del item
 
-    def jobs(self, cache: OutcomeCache | None, take: Callable[[list[Outcome]], None]) -> Iterator[Job]:
+    def jobs(self) -> Iterator[Job]:
         """Yield the jobs of each item: what is not stored, in parts, which in this process share the first run."""
-        count = count_of(self.images)
+        count = self.images.count
         for item in self.items():
             missing = self.settings
-            if cache is not None:
-                stored = cache.found(item)
-                take([outcome for outcome in stored if outcome is not None])
+            if self.cache is not None:
+                stored = self.cache.found(item)
+                self.take([outcome for outcome in stored if outcome is not None])
                 missing = tuple(one for one, outcome in zip(missing, stored, strict=True) if outcome is None)
             parts = _parts(self.runner, missing, self.executor, count)
             start = SharedStart() if len(parts) > 1 and runs_here(self.executor) else None
@@ -387,29 +380,22 @@ class _Batch:
                 yield Job(item, part, self.kept, self.shown, start)
             del item, start
 
-    def series_runs(
-        self, state: State, cache: OutcomeCache | None, take: Callable[[list[Outcome]], None]
-    ) -> SeriesRuns:
+    def series_runs(self, state: State) -> SeriesRuns:
         """Return the runs of series; those of which all is stored are taken from there."""
-        items, done = self.items(), set[Done]()
-        if cache is not None and cache.has_outcomes:
-            stored, done = whole_series(self.items(), self.settings, cache.found)
-            take(stored)
-        elif cache is not None:
-            items = cache.noting(items)
-        if self.executor is None:
-            return SeriesRuns(items, [self.settings], state, 1, done)
-        room: float = _JOBS_PER_WORKER * worker_count(self.executor)
-        parts = in_parts(self.settings, int(room))
+        items, done = self.items(), frozenset[Done]()
+        if self.cache is not None and self.cache.has_outcomes:
+            stored, done = whole_series(self.items(), self.settings, self.cache.found)
+            self.take(stored)
+        elif self.cache is not None:
+            items = self.cache.noting(items)
+        room = 1 if self.executor is None else _JOBS_PER_WORKER * worker_count(self.executor)
+        count = min(room, len(self.settings))
+        cuts = [len(self.settings) * part // count for part in range(count + 1)]
+        template = Job(Item(0, "", {}), keep=self.kept, show=self.shown)
+        jobs = [replace(template, settings=self.settings[first:end]) for first, end in pairwise(cuts)]
         # Of what is in memory anyway, or in files, so many are taken that all series begin.
-        is_held = isinstance(self.images, FileSet | Video) or holds_its_arrays(self.images)
-        room = math.inf if is_held else room
-        return SeriesRuns(items, parts, state, room, done)
-
-    def series_jobs(self, runs: SeriesRuns) -> Iterator[Job | None]:
-        for one in runs:
-            yield None if one is None else Job(one[0], one[1], self.kept, self.shown, states=one[2])
-            del one
+        is_taken = self.images.is_held and self.executor is not None
+        return SeriesRuns(items, jobs, state, math.inf if is_taken else room, done)
 
 
 def run_items(
@@ -440,28 +426,26 @@ def run_items(
     in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
-    images = image_set(images)
-    count, is_sweep = count_of(images), kind == "sweep"
-    if is_sweep:
-        _require_room(runner, settings, shown, count or 1)
-    batch = _Batch(runner, images, series, in_order, executor, kept, shown, is_sweep)
+    given = image_set(images)
+    if kind == "sweep":
+        _require_room(runner, settings, shown, given.count or 1)
     # Where what is stored decides which series are run, the items are gone through twice.
-    is_read = state is None or not (isinstance(images, Iterator) or isinstance(series, Iterator))
+    is_read = state is None or not (isinstance(given.values, Iterator) or isinstance(series, Iterator))
     outcomes: list[Outcome] = []
     with (
         outcome_cache(
             store, kind, runner, name, keep=kept, show=shown, settings=in_order, state=state, is_read=is_read
         ) as cache,
-        progress_bar(progress, count and count * len(settings), kind, unit=_UNITS[kind]) as advance,
+        progress_bar(progress, given.count and given.count * len(settings), kind, unit=_UNITS[kind]) as advance,
     ):
 
-        def take(found: list[Outcome]) -> None:
+        def take(found: Sequence[Outcome]) -> None:
             outcomes.extend(found)
             advance(len(found), sum(outcome.has_failed for outcome in found))
 
-        runs = None if state is None else batch.series_runs(state, cache, take)
-        source = batch.jobs(cache, take) if runs is None else batch.series_jobs(runs)
-        for found in run_jobs(runner, source, executor, ahead=ahead):
+        batch = _Batch(runner, given, series, in_order, executor, kept, shown, cache, take)
+        runs = None if state is None else batch.series_runs(state)
+        for found in run_jobs(runner, batch.jobs() if runs is None else runs, executor, ahead=ahead):
             settled = found if runs is None else runs.settle(found)
             if cache is not None:
                 cache.add(settled)

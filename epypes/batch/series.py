@@ -6,10 +6,9 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 from epypes.batch.items import Item
-from epypes.batch.job import Setting, State
+from epypes.batch.job import Job, Setting, State
 from epypes.batch.results import Outcome
 
 # A series and a setting of it, by identity.
@@ -22,24 +21,21 @@ class _Chain:
 
     Attributes
     ----------
-    settings
-        With which each item is run.
-    states
-        What the next item begins with, by setting.
+    job
+        Has the settings with which each item is run, and the states that the next item begins with.
     waiting
         The items that have not begun.
     pending
         How many outcomes of the item that runs are still to come.
     """
 
-    settings: tuple[Setting, ...]
-    states: list[State]
+    job: Job
     waiting: deque[Item] = field(default_factory=deque)
     pending: int = 0
 
 
 class SeriesRuns:
-    """What can be run now of several series: iterate over it to get items, with their settings and states.
+    """What can be run now of several series: iterate over it to get jobs.
 
     Series, and the parts of the settings, run side by side. Where all items that have come wait for others of their
     series, None is given: report outcomes, then iterate on.
@@ -49,7 +45,7 @@ class SeriesRuns:
     items
         With the keys of their series; taken one by one.
     parts
-        The settings, in parts that run side by side.
+        A job for each part of the settings, whose item and states are still to be set; parts run side by side.
     state
         What each series begins with.
     room
@@ -61,7 +57,7 @@ class SeriesRuns:
     def __init__(
         self,
         items: Iterable[Item],
-        parts: Sequence[tuple[Setting, ...]],
+        parts: Sequence[Job],
         state: State,
         room: float,
         done: AbstractSet[Done] = frozenset(),
@@ -73,7 +69,7 @@ class SeriesRuns:
         self._waiting = 0
         self._running: dict[tuple[int, int], tuple[_Chain, int]] = {}
 
-    def __iter__(self) -> Iterator[tuple[Item, tuple[Setting, ...], tuple[State, ...]] | None]:
+    def __iter__(self) -> Iterator[Job | None]:
         is_over = False
         while True:
             while not (self._ready or is_over) and self._waiting < self._room:
@@ -91,29 +87,33 @@ class SeriesRuns:
 
     def _take(self, item: Item) -> None:
         if item.series not in self._chains:
-            left = [tuple(one for one in part if (item.series, id(one)) not in self._done) for part in self._parts]
-            self._chains[item.series] = [_Chain(part, [self._state] * len(part)) for part in left if part]
+            chains = self._chains[item.series] = []
+            for part in self._parts:
+                left = tuple(one for one in part.settings if (item.series, id(one)) not in self._done)
+                if left:
+                    chains.append(_Chain(replace(part, settings=left, states=(self._state,) * len(left))))
         for chain in self._chains[item.series]:
             chain.waiting.append(item)
             self._waiting += 1
             if not chain.pending and len(chain.waiting) == 1:
                 self._ready.append(chain)
 
-    def _begin(self, chain: _Chain) -> tuple[Item, tuple[Setting, ...], tuple[State, ...]]:
-        item = chain.waiting.popleft()
+    def _begin(self, chain: _Chain) -> Job:
+        job = replace(chain.job, item=chain.waiting.popleft())
         self._waiting -= 1
-        chain.pending = len(chain.settings)
-        for place, setting in enumerate(chain.settings):
-            self._running[item.number, id(setting)] = chain, place
-        return item, chain.settings, tuple(chain.states)
+        chain.pending = len(job.settings)
+        for place, setting in enumerate(job.settings):
+            self._running[job.item.number, id(setting)] = chain, place
+        return job
 
     def settle(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
         """Take what has been run: the next item of its series can begin; return the outcomes without their states."""
         settled = []
         for outcome in outcomes:
             chain, place = self._running.pop((outcome.number, id(outcome.setting)))
-            # What could not be run at all has left no state.
-            chain.states[place] = outcome.state or chain.states[place]
+            if outcome.state:  # what could not be run at all has left none
+                states = chain.job.states
+                chain.job = replace(chain.job, states=(*states[:place], outcome.state, *states[place + 1 :]))
             chain.pending -= 1
             if not chain.pending and chain.waiting:
                 self._ready.append(chain)
@@ -123,7 +123,7 @@ class SeriesRuns:
 
 def whole_series(
     items: Iterable[Item], settings: Sequence[Setting], found: Callable[[Item], list[Outcome | None]]
-) -> tuple[list[Outcome], set[Done]]:
+) -> tuple[list[Outcome], frozenset[Done]]:
     """Return the outcomes of the series of which all are known, and which these are.
 
     A series of which some are missing is run from its beginning, since the state amid it is not stored.
@@ -147,10 +147,5 @@ def whole_series(
                 columns.pop(key, None)
             elif key not in missing:
                 columns.setdefault(key, []).append(outcome)
-    return [outcome for column in columns.values() for outcome in column], set(columns)
+    return [outcome for column in columns.values() for outcome in column], frozenset(columns)
 
-
-def in_parts(settings: tuple[Setting, ...], most: int) -> list[tuple[Setting, ...]]:
-    """Cut settings into at most so many parts of about the same size."""
-    count = min(most, len(settings))
-    return [settings[first:end] for first, end in pairwise(len(settings) * part // count for part in range(count + 1))]
