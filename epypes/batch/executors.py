@@ -90,9 +90,7 @@ def run_jobs(
     if not isinstance(executor, Executor):
         raise TypeError(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
     most, over = ahead or _JOBS_PER_WORKER * worker_count(executor), threading.Event()
-    backend: _Backend = _Processes(runner, executor)
-    if runs_here(executor):
-        backend = _Threads(runner, executor, (stop, over))
+    backend = _Threads(runner, executor, (stop, over)) if runs_here(executor) else _Processes(runner, executor)
     return _run_in_flight(backend, jobs, most, over, stop)
 
 
@@ -324,5 +322,4 @@ class _Processes(_Backend):
             raise _FilesMissing
         if isinstance(found, str):
             raise ScaleError(found)
-        # What ran in this thread has not been packed.
-        return found if found and found[0].setting is job.settings[0] else unpacked_outcomes(found, job)
+        return unpacked_outcomes(found, job)

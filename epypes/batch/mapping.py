@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cache import OutcomeCache, outcome_cache
-from epypes.batch.contact_sheet import Sheet, sheet_of
+from epypes.batch.contact_sheet import Sheet, sheet_of, sheet_page
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
 from epypes.batch.items import ImageSet, Item, SeriesKeys, detached_runner, image_set, items_of, with_series
 from epypes.batch.job import NO_SETTING, Job, SharedStart, State
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, OutcomeSequence, fixed_columns, outcomes_frame, outcomes_html
+from epypes.batch.results import BatchResult, Outcome, outcomes_frame, outcomes_html
 from epypes.batch.series import Done, SeriesRuns, whole_series
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
@@ -38,7 +38,7 @@ _UNITS: Final = {"map": "image", "sweep": "setting"}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class MapResult(OutcomeSequence):
+class MapResult(BatchResult[Outcome]):
     """The results of a map: a sequence of outcomes in the order of the images, shown as a table.
 
     Attributes
@@ -60,19 +60,20 @@ class MapResult(OutcomeSequence):
         """
         return outcomes_frame(self.outcomes, self.cg)
 
-    def __repr__(self) -> str:
-        return f"<MapResult: {self._caption}>"
+    @property
+    def _rows(self) -> tuple[Outcome, ...]:
+        return self.outcomes
 
     @property
     def _caption(self) -> str:
         return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": outcomes_html(self.outcomes, self.cg, self._caption)}
+    def _page(self) -> str:
+        return outcomes_html(self.outcomes, self.cg, self._caption)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class SweepResult(OutcomeSequence):
+class SweepResult(BatchResult[Outcome]):
     """The results of a sweep; shows itself as a contact sheet.
 
     Attributes
@@ -95,11 +96,7 @@ class SweepResult(OutcomeSequence):
         Its columns are name, the hyperparameters that were varied, failure (None, or what failed), the sink tokens,
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
-        taken = fixed_columns(self.outcomes)
-        varied = {
-            f"{name} (hyperparameter)" if name in taken else name: [one.setting.get(name) for one in self.outcomes]
-            for name in self.names
-        }
+        varied = {name: [outcome.setting.get(name) for outcome in self.outcomes] for name in self.names}
         return outcomes_frame(self.outcomes, self.runner.cg, varied)
 
     def sheet(self, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Sheet:
@@ -123,15 +120,17 @@ class SweepResult(OutcomeSequence):
         """
         return sheet_of(self.runner.cg, self.outcomes, token, rows, columns)
 
-    def __repr__(self) -> str:
-        failed = f"{len(self.failures)} failed"
-        varied = ", ".join(self.names)
-        return f"<SweepResult: {counted(len(self), 'outcome')} of {varied:.40}; {failed}>"
+    @property
+    def _rows(self) -> tuple[Outcome, ...]:
+        return self.outcomes
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        shown = self.sheet()
-        bundle = shown._repr_mimebundle_()
-        return {**bundle, "text/plain": bundle["text/plain"].replace(repr(shown), repr(self))}
+    @property
+    def _caption(self) -> str:
+        failed, varied = len(self.failures), ", ".join(self.names)
+        return f"{counted(len(self), 'outcome')} of {varied:.40}; {failed} failed"
+
+    def _page(self) -> str:
+        return sheet_page(self.sheet())
 
 
 def map_images(

@@ -14,7 +14,7 @@ import threading
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
@@ -28,9 +28,9 @@ from epypes.batch.items import case_items, detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import tokens_of
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
-from epypes.batch.thumbnails import data_uri, thumbnail_of_value
-from epypes.display.text import content, cut, cut_name, escape
+from epypes.batch.results import BatchResult, Outcome, failure_column, frame_of, html_table, value_text
+from epypes.batch.thumbnails import picture_element, thumbnail_of_value
+from epypes.display.text import content, cut, cut_name
 from epypes.errors import ScaleError
 from epypes.graph import subgraph
 from epypes.nothing import Nothing
@@ -57,6 +57,10 @@ _REASON_CHARACTERS: Final = 300
 _FAILURE: Final = "failure"
 _NANOSECONDS: Final = "total_ns"
 _ABOUT: Final = "about"
+# On the page.
+_MOST_REASONS: Final = 3
+_TEXT_ROOM: Final = 200
+_CURVE_PX: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +87,14 @@ class Trial:
     failure: str = ""
     total_ns: int = 0
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether there is no value."""
+        return self.value is None
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OptimizeResult:
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class OptimizeResult(BatchResult[Trial]):
     """The trials of a search; made by ``ep.optimize``.
 
     Attributes
@@ -104,21 +113,12 @@ class OptimizeResult:
         Whether the search was stopped before all trials were run.
     """
 
-    trials: tuple[Trial, ...] = field(repr=False)
+    trials: tuple[Trial, ...]
     direction: Direction
     metric: str
-    axes: tuple[Axis, ...] = field(repr=False)
-    study: optuna.Study = field(repr=False)
+    axes: tuple[Axis, ...]
+    study: optuna.Study
     was_stopped: bool = False
-
-    def __len__(self) -> int:
-        return len(self.trials)
-
-    def __iter__(self) -> Iterator[Trial]:
-        return iter(self.trials)
-
-    def __getitem__(self, index: int) -> Trial:
-        return self.trials[index]
 
     @property
     def best_trial(self) -> Trial:
@@ -145,11 +145,6 @@ class OptimizeResult:
         return _value(self.best_trial)
 
     @property
-    def failures(self) -> tuple[Trial, ...]:
-        """The trials that failed."""
-        return tuple(trial for trial in self.trials if trial.value is None)
-
-    @property
     def importances(self) -> dict[str, float]:
         """How much each hyperparameter matters for good values, as parts of 1, the most important first.
 
@@ -161,7 +156,7 @@ class OptimizeResult:
         completed = self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
         if len({trial.value for trial in completed}) < 2:
             return {}
-        with quiet_optuna():
+        with _quiet_optuna():
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             return dict(optuna.importance.get_param_importances(self.study, evaluator=evaluator))
 
@@ -179,34 +174,46 @@ class OptimizeResult:
             ``failure`` (None, or the reason), and ``ms``: of the functions, over all cases. A hyperparameter that is
             called like one of these has `` (hyperparameter)`` after its name.
         """
-        taken = {"trial", self.metric, "state", "failure", "ms"}
-        columns: dict[str, Any] = {"trial": [trial.number for trial in self.trials]}
-        for axis in self.axes:
-            title = f"{axis.token} (hyperparameter)" if axis.token in taken else axis.token
-            columns[title] = [trial.setting[axis.token] for trial in self.trials]
-        columns[self.metric] = [float("nan") if trial.value is None else trial.value for trial in self.trials]
-        columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
-        columns["failure"] = object_column([trial.failure or None for trial in self.trials])
-        columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
-        return frame_of(columns)
+        trials = self.trials
+        return frame_of([
+            ("trial", [trial.number for trial in trials], ""),
+            *((axis.token, [trial.setting[axis.token] for trial in trials], "hyperparameter") for axis in self.axes),
+            (self.metric, [math.nan if trial.value is None else trial.value for trial in trials], ""),
+            ("state", ["failed" if trial.has_failed else "complete" for trial in trials], ""),
+            failure_column(trial.failure for trial in trials),
+            ("ms", [trial.total_ns / 1e6 for trial in trials], ""),
+        ])  # fmt: skip
 
     def history_plot(self) -> Figure:
         """Draw the value of each trial that completed, and the best one so far, as Optuna does with Matplotlib."""
         from optuna.visualization.matplotlib import plot_optimization_history
 
-        _ = self.best_trial  # without one there is nothing to draw
-        return _figure(lambda: plot_optimization_history(self.study, target_name=self.metric))
+        return self._figure(lambda: plot_optimization_history(self.study, target_name=self.metric))
 
     def importance_plot(self) -> Figure:
         """Draw how much each hyperparameter matters, as Optuna does with Matplotlib."""
         from optuna.importance import PedAnovaImportanceEvaluator
         from optuna.visualization.matplotlib import plot_param_importances
 
-        _ = self.best_trial
-        with quiet_optuna():
-            # The default one of older versions needs scikit-learn.
-            evaluator = PedAnovaImportanceEvaluator()
-            return _figure(lambda: plot_param_importances(self.study, evaluator, target_name=self.metric))
+        # The default evaluator of older versions needs scikit-learn.
+        return self._figure(
+            lambda: plot_param_importances(self.study, PedAnovaImportanceEvaluator(), target_name=self.metric)
+        )
+
+    def _figure(self, draw: Callable[[], Axes]) -> Figure:
+        """Return a figure that Optuna draws; it leaves no style set, and no figure open in pyplot."""
+        from matplotlib import pyplot
+
+        _ = self.best_trial  # without one there is nothing to draw
+        with pyplot.rc_context(), _quiet_optuna():
+            draw()
+            figure = pyplot.gcf()
+        pyplot.close(figure)
+        return figure
+
+    @property
+    def _rows(self) -> tuple[Trial, ...]:
+        return self.trials
 
     @property
     def _caption(self) -> str:
@@ -215,11 +222,40 @@ class OptimizeResult:
         state = f"{f', {failed} failed' if failed else ''}{', stopped' * self.was_stopped}"
         return f"{counted(len(self.trials), 'trial')}{state}; {found}"
 
-    def __repr__(self) -> str:
-        return f"<OptimizeResult: {self._caption}>"
+    def _page(self) -> str:
+        """Return the curve of the best value so far, the table of what was found, and why trials failed."""
+        best = best_of(self.trials, self.direction)
+        parts = [f"<p>{content(self._caption)}</p>"]
+        if best is not None:
+            parts += [self._curve(), self._table(best)]
+        reasons = list(dict.fromkeys(trial.failure for trial in self.failures))
+        if reasons:
+            items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
+            more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
+            parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
+        return f"<div>{''.join(parts)}</div>"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": _page(self)}
+    def _curve(self) -> str:
+        """Return a picture of the best value so far, by trial that completed."""
+        import numpy as np
+
+        values = [trial.value for trial in self.trials if trial.value is not None]
+        so_far = np.maximum.accumulate(values) if self.direction == "maximize" else np.minimum.accumulate(values)
+        picture, metric = thumbnail_of_value(so_far), cut_name(self.metric, 30)
+        text = f"The best {metric} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}."
+        return "" if picture is None else picture_element(picture, text, _TEXT_ROOM, _CURVE_PX)
+
+    def _table(self, best: Trial) -> str:
+        first, parts = self.trials[0], self.importances
+        tokens = sorted((axis.token for axis in self.axes), key=lambda token: -parts.get(token, 0.0))
+        first_value = "failed" if first.value is None else f"{first.value:.6g}"
+        columns = [
+            ("hyperparameter", [self.metric, *tokens]),
+            (f"best (trial {best.number})", [f"{best.value:.6g}", *(value_text(best.setting[t]) for t in tokens)]),
+            ("first trial", [first_value, *(value_text(first.setting[token]) for token in tokens)]),
+            ("importance", ["", *(f"{parts[token]:.0%}" if token in parts else "" for token in tokens)]),
+        ]
+        return html_table("", columns)
 
 
 def best_of(trials: Sequence[Trial], direction: Direction) -> Trial | None:
@@ -548,7 +584,7 @@ class _Search:
         self._distributions = {axis.token: axis.distribution for axis in axes}
         self._storage: optuna.storages.RDBStorage | None = None
         self._stored: optuna.Study | None = None
-        with quiet_optuna():
+        with _quiet_optuna():
             before = [] if store is None or key is None else self._open(store, key)
             # A search that goes on has another seed: the same numbers again would be the same trials again.
             sampler = optuna.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
@@ -642,67 +678,8 @@ def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     return [trial for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
 
 
-# -- figures and page -------------------------------------------------------------------------------------------
-
-
-def _figure(draw: Callable[[], Axes]) -> Figure:
-    """Return a figure that Optuna draws; it leaves no style set, and no figure open in pyplot."""
-    from matplotlib import pyplot
-
-    with pyplot.rc_context(), quiet_optuna():
-        draw()
-        figure = pyplot.gcf()
-    pyplot.close(figure)
-    return figure
-
-
-_MOST_REASONS: Final = 3
-
-
-def _page(result: OptimizeResult) -> str:
-    best = best_of(result.trials, result.direction)
-    parts = [f"<p>{content(result._caption)}</p>"]
-    if best is not None:
-        parts += [_curve(result), _table(result, best)]
-    reasons = list(dict.fromkeys(trial.failure for trial in result.failures))
-    if reasons:
-        items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
-        more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
-        parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
-    return f"<div>{''.join(parts)}</div>"
-
-
-def _curve(result: OptimizeResult) -> str:
-    """Return a picture of the best value so far, by trial that completed."""
-    import numpy as np
-
-    values = [trial.value for trial in result.trials if trial.value is not None]
-    so_far = np.maximum.accumulate(values) if result.direction == "maximize" else np.minimum.accumulate(values)
-    picture = thumbnail_of_value(so_far)
-    if picture is None:
-        return ""
-    alt = escape(f"The best {cut_name(result.metric, 30)} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}.")
-    return f'<img src="{data_uri(picture)}" width="256" alt="{alt}" title="{alt}">'
-
-
-def _table(result: OptimizeResult, best: Trial) -> str:
-    first, parts = result.trials[0], result.importances
-    rows = [
-        (
-            axis.token,
-            value_text(best.setting[axis.token]),
-            value_text(first.setting[axis.token]),
-            f"{parts[axis.token]:.0%}" if axis.token in parts else "",
-        )
-        for axis in sorted(result.axes, key=lambda axis: -parts.get(axis.token, 0.0))
-    ]
-    values = (result.metric, f"{best.value:.6g}", "failed" if first.value is None else f"{first.value:.6g}", "")
-    head = ("hyperparameter", f"best (trial {best.number})", "first trial", "importance")
-    return html_table("", head, [values, *rows])
-
-
 @contextlib.contextmanager
-def quiet_optuna() -> Iterator[None]:
+def _quiet_optuna() -> Iterator[None]:
     """Keep Optuna from printing, and from warning that a feature used here was once experimental."""
     import optuna
 

@@ -148,4 +148,3 @@ def whole_series(
             elif key not in missing:
                 columns.setdefault(key, []).append(outcome)
     return [outcome for column in columns.values() for outcome in column], frozenset(columns)
-
