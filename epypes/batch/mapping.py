@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -15,10 +15,9 @@ from epypes.batch.contact_sheet import Sheet, sheet_of, sheet_page
 from epypes.batch.executors import run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
 from epypes.batch.items import ImageSet, Item, SeriesKeys, detached_runner, image_set, items_of, with_series
-from epypes.batch.job import NO_SETTING, Job, SharedStart, State
+from epypes.batch.job import NO_SETTING, Done, Job, SeriesRuns, SharedStart, State, whole_series
 from epypes.batch.progress import progress_bar
 from epypes.batch.results import BatchResult, Outcome, outcomes_frame, outcomes_html
-from epypes.batch.series import Done, SeriesRuns, whole_series
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -219,11 +218,12 @@ def map_images(
     >>> [outcome.values["brightness"] for outcome in result]
     [3.0, 7.0]
     """
-    outcomes = run_items(
-        runner, images, (NO_SETTING,), executor,
-        kind="map", keep=keep, show=show, series=series, store=store, name=name, progress=progress, ahead=ahead,
+    batch = _Batch(
+        runner=detached_runner(runner), images=image_set(images), settings=(NO_SETTING,), executor=executor, kind="map",
+        keep=tokens_of(runner, keep), show=None if show is None else tokens_of(runner, show), series=series,
+        store=store, name=name, progress=progress, ahead=ahead,
     )  # fmt: skip
-    return MapResult(runner.cg, outcomes)
+    return MapResult(runner.cg, batch.run())
 
 
 def sweep(
@@ -304,27 +304,12 @@ def sweep(
         images = [Item(0, "last payload", _last_payload(runner))]
         state = None if runner.last is None else runner.last.state_before or None
     settings = settings_of(runner, grid, how=how, n=n, seed=seed)
-    outcomes = run_items(
-        runner, images, settings, executor,
-        kind="sweep", keep=keep, show=show, series=series, state=state, store=store, name=name, progress=progress,
+    batch = _Batch(
+        runner=detached_runner(runner), images=image_set(images), settings=settings, executor=executor, kind="sweep",
+        keep=tokens_of(runner, keep), show=None if show is None else tokens_of(runner, show), series=series,
+        store=store, name=name, progress=progress, state=state,
     )  # fmt: skip
-    return SweepResult(outcomes, tuple(settings[0]), runner)
-
-
-def _require_room(
-    runner: CompGraphRunner, settings: Sequence[Setting], shown: Sequence[str] | None, images: int
-) -> None:
-    """Raise ScaleError if the outcomes of a sweep, or the pictures of tokens that vary, are too many to hold."""
-    require_room(len(settings), settings[0], images)
-    varying = {token for name in functions_after(runner.cg, *settings[0]) for token in runner.cg.func_outputs(name)}
-    tokens = varying if shown is None else varying.intersection(shown)
-    pictures = len(settings) * images * len(tokens)
-    if pictures > _MOST_PICTURES:
-        raise ScaleError(
-            f"Thumbnails of {len(tokens)} tokens with {len(settings):,} settings on {images:,} images are up to "
-            f"{pictures:,} pictures, and at most {_MOST_PICTURES:,} can be held. Name fewer, as show=(), or take "
-            "fewer values."
-        )
+    return SweepResult(batch.run(), tuple(settings[0]), runner)
 
 
 def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
@@ -338,118 +323,137 @@ def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
 # -- items and settings as jobs -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Batch:
-    """What is run on which images; ``settings`` are in the order in which they are run."""
+    """What is run on which images: the attributes are the parameters of ``map`` and ``sweep``.
+
+    ``kind`` is ``"map"`` or ``"sweep"``. Each series begins with ``state``, without it with the initial state of the
+    graph. The runner is detached: if the caller changes hyperparameters meanwhile, that does not change what is
+    computed and stored.
+    """
 
     runner: CompGraphRunner
     images: ImageSet
-    series: SeriesKeys | None
     settings: tuple[Setting, ...]
     executor: Executor | None
-    kept: tuple[str, ...]
-    shown: tuple[str, ...] | None
-    cache: OutcomeCache | None
-    take: Callable[[Sequence[Outcome]], None]
+    kind: str
+    keep: tuple[str, ...]
+    show: tuple[str, ...] | None
+    series: SeriesKeys | None
+    store: str | Path | Store | None
+    name: str | None
+    progress: bool | None
+    state: State | None = None
+    ahead: int | None = None
+    outcomes: list[Outcome] = field(default_factory=list)
 
-    def items(self) -> Iterator[Item]:
-        items = with_series(items_of(self.images, self.runner), self.series)
-        return items if self.images.count is not None or self.settings[0] is NO_SETTING else self._counted(items)
+    def run(self) -> tuple[Outcome, ...]:
+        """Return the outcomes of items under settings: item by item, in each in the order of its settings."""
+        runner, images = self.runner, self.images
+        state = runner.state or None if self.state is None else self.state
+        # By object: a setting comes back as the very mapping that was sent.
+        places = {id(setting): place for place, setting in enumerate(self.settings)}
+        self.settings = tuple(self.settings[place] for place in running_order(runner.cg, self.settings))
+        if self.kind == "sweep":
+            self._require_room(images.count or 1)
+        # Where what is stored decides which series are run, the items are gone through twice.
+        is_read = state is None or not (isinstance(images.values, Iterator) or isinstance(self.series, Iterator))
+        total = None if images.count is None else images.count * len(self.settings)
+        with (
+            outcome_cache(
+                self.store, self.kind, runner, self.name,
+                keep=self.keep, show=self.show, settings=self.settings, state=state, is_read=is_read,
+            ) as cache,
+            progress_bar(self.progress, total, self.kind, unit=_UNITS[self.kind]) as advance,
+        ):  # fmt: skip
 
-    def _counted(self, items: Iterator[Item]) -> Iterator[Item]:
-        """Yield items as long as the outcomes of a sweep can be held: how many there are is known when they come."""
-        for item in items:
-            _require_room(self.runner, self.settings, self.shown, item.number + 1)
+            def take(found: Sequence[Outcome]) -> None:
+                self.outcomes += found
+                advance(len(found), sum(outcome.has_failed for outcome in found))
+
+            runs = None if state is None else self._series_runs(state, cache, take)
+            jobs = self._jobs(cache, take) if runs is None else runs
+            for found in run_jobs(runner, jobs, self.executor, ahead=self.ahead):
+                settled = found if runs is None else runs.settle(found)
+                if cache is not None:
+                    cache.add(settled)
+                take(settled)
+        return tuple(sorted(self.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
+
+    def _require_room(self, images: int) -> None:
+        """Raise ScaleError if the outcomes of a sweep, or the pictures of tokens that vary, are too many to hold."""
+        settings, cg = self.settings, self.runner.cg
+        require_room(len(settings), settings[0], images)
+        varying = {token for name in functions_after(cg, *settings[0]) for token in cg.func_outputs(name)}
+        tokens = varying if self.show is None else varying.intersection(self.show)
+        pictures = len(settings) * images * len(tokens)
+        if pictures > _MOST_PICTURES:
+            raise ScaleError(
+                f"Thumbnails of {len(tokens)} tokens with {len(settings):,} settings on {images:,} images are up to "
+                f"{pictures:,} pictures, and at most {_MOST_PICTURES:,} can be held. Name fewer, as show=(), or take "
+                "fewer values."
+            )
+
+    def _items(self) -> Iterator[Item]:
+        for item in with_series(items_of(self.images, self.runner), self.series):
+            # How many a generator gives is known when it gives them; a map may be of any number.
+            if self.kind == "sweep" and self.images.count is None:
+                self._require_room(item.number + 1)
             yield item
             # This generator waits for its caller, and must not keep the item alive meanwhile.
             del item
 
-    def jobs(self) -> Iterator[Job]:
+    def _jobs(self, cache: OutcomeCache | None, take: Callable[[Sequence[Outcome]], None]) -> Iterator[Job]:
         """Yield the jobs of each item: what is not stored, in parts, which in this process share the first run."""
-        count = self.images.count
-        for item in self.items():
+        for item in self._items():
             missing = self.settings
-            if self.cache is not None:
-                stored = self.cache.found(item)
-                self.take([outcome for outcome in stored if outcome is not None])
+            if cache is not None:
+                stored = cache.found(item)
+                take([outcome for outcome in stored if outcome is not None])
                 missing = tuple(one for one, outcome in zip(missing, stored, strict=True) if outcome is None)
-            parts = _parts(self.runner, missing, self.executor, count)
+            parts = self._parts(missing)
             start = SharedStart() if len(parts) > 1 and runs_here(self.executor) else None
             for part in parts:
-                yield Job(item, part, self.kept, self.shown, start)
+                yield Job(item, part, self.keep, self.show, start)
             del item, start
 
-    def series_runs(self, state: State) -> SeriesRuns:
+    def _parts(self, settings: tuple[Setting, ...]) -> list[tuple[Setting, ...]]:
+        """Cut the settings of an item into parts that several workers run at the same time."""
+        if self.executor is None or len(settings) < 2:
+            return [settings] if settings else []
+        workers = worker_count(self.executor)
+        # Outside of this process each part computes what all have in common: there are only as many as keep all
+        # workers at work.
+        count = -(-workers // max(self.images.count or workers, 1))
+        count *= _PARTS if count > 1 and runs_here(self.executor) else 1
+        # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
+        places = steps(self.runner.cg, settings)
+        places = places if len(places) >= workers else list(range(len(settings)))
+        return _cut(settings, max(count, -(-len(settings) // _MOST_SETTINGS)), places)
+
+    def _series_runs(
+        self, state: State, cache: OutcomeCache | None, take: Callable[[Sequence[Outcome]], None]
+    ) -> SeriesRuns:
         """Return the runs of series; those of which all is stored are taken from there."""
-        items, done = self.items(), frozenset[Done]()
-        if self.cache is not None and self.cache.has_outcomes:
-            stored, done = whole_series(self.items(), self.settings, self.cache.found)
-            self.take(stored)
-        elif self.cache is not None:
-            items = self.cache.noting(items)
+        items, done = self._items(), frozenset[Done]()
+        if cache is not None and cache.has_outcomes:
+            stored, done = whole_series(self._items(), self.settings, cache.found)
+            take(stored)
+        elif cache is not None:
+            items = cache.noting(items)
         room = 1 if self.executor is None else _JOBS_PER_WORKER * worker_count(self.executor)
-        count = min(room, len(self.settings))
-        cuts = [len(self.settings) * part // count for part in range(count + 1)]
-        template = Job(Item(0, "", {}), keep=self.kept, show=self.shown)
-        jobs = [replace(template, settings=self.settings[first:end]) for first, end in pairwise(cuts)]
+        template = Job(Item(0, "", {}), keep=self.keep, show=self.show)
+        parts = [replace(template, settings=part) for part in _cut(self.settings, room, range(len(self.settings)))]
         # Of what is in memory anyway, or in files, so many are taken that all series begin.
         is_taken = self.images.is_held and self.executor is not None
-        return SeriesRuns(items, jobs, state, math.inf if is_taken else room, done)
+        return SeriesRuns(items, parts, state, math.inf if is_taken else room, done)
 
 
-def run_items(
-    runner: CompGraphRunner,
-    images: Any,
-    settings: tuple[Setting, ...],
-    executor: Executor | None,
-    *,
-    kind: str,
-    keep: Sequence[str],
-    show: Sequence[str] | None,
-    series: SeriesKeys | None,
-    store: str | Path | Store | None,
-    name: str | None,
-    progress: bool | None,
-    state: State | None = None,
-    ahead: int | None = None,
-) -> tuple[Outcome, ...]:
-    """Return the outcomes of items under settings: item by item, in each in the order of its settings.
-
-    The parameters are those of ``map`` and ``sweep``; ``kind`` is ``"map"`` or ``"sweep"``. Each series begins with
-    ``state``, without it with the initial state of the graph.
-    """
-    # If the caller changes hyperparameters meanwhile, that does not change what is computed and stored.
-    runner = detached_runner(runner)
-    state = runner.state or None if state is None else state
-    kept, shown = tokens_of(runner, keep), None if show is None else tokens_of(runner, show)
-    in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
-    # By object: a setting comes back as the very mapping that was sent.
-    places = {id(setting): place for place, setting in enumerate(settings)}
-    given = image_set(images)
-    if kind == "sweep":
-        _require_room(runner, settings, shown, given.count or 1)
-    # Where what is stored decides which series are run, the items are gone through twice.
-    is_read = state is None or not (isinstance(given.values, Iterator) or isinstance(series, Iterator))
-    outcomes: list[Outcome] = []
-    with (
-        outcome_cache(
-            store, kind, runner, name, keep=kept, show=shown, settings=in_order, state=state, is_read=is_read
-        ) as cache,
-        progress_bar(progress, given.count and given.count * len(settings), kind, unit=_UNITS[kind]) as advance,
-    ):
-
-        def take(found: Sequence[Outcome]) -> None:
-            outcomes.extend(found)
-            advance(len(found), sum(outcome.has_failed for outcome in found))
-
-        batch = _Batch(runner, given, series, in_order, executor, kept, shown, cache, take)
-        runs = None if state is None else batch.series_runs(state)
-        for found in run_jobs(runner, batch.jobs() if runs is None else runs, executor, ahead=ahead):
-            settled = found if runs is None else runs.settle(found)
-            if cache is not None:
-                cache.add(settled)
-            take(settled)
-    return tuple(sorted(outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
+def _cut(settings: tuple[Setting, ...], most: int, places: Sequence[int]) -> list[tuple[Setting, ...]]:
+    """Cut settings into at most so many parts of about the same size, each of which begins at one of some places."""
+    count = min(most, len(places))
+    cuts = [*(places[len(places) * part // count] for part in range(count)), len(settings)]
+    return [settings[first:end] for first, end in pairwise(cuts)]
 
 
 def tokens_of(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:
@@ -458,22 +462,3 @@ def tokens_of(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str,
     for token in tokens:
         runner.cg.require_token(token)
     return tokens
-
-
-def _parts(
-    runner: CompGraphRunner, settings: tuple[Setting, ...], executor: Executor | None, count: int | None
-) -> list[tuple[Setting, ...]]:
-    """Cut the settings of an item into parts that several workers run at the same time."""
-    if executor is None or len(settings) < 2:
-        return [settings] if settings else []
-    workers = worker_count(executor)
-    # Outside of this process each part computes what all have in common: there are only as many as keep all
-    # workers at work.
-    parts = -(-workers // max(count or workers, 1))
-    parts *= _PARTS if parts > 1 and runs_here(executor) else 1
-    # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
-    places = steps(runner.cg, settings)
-    places = places if len(places) >= workers else list(range(len(settings)))
-    parts = min(max(parts, -(-len(settings) // _MOST_SETTINGS)), len(places))
-    cuts = [*(places[len(places) * part // parts] for part in range(parts)), len(settings)]
-    return [settings[first:end] for first, end in pairwise(cuts)]
