@@ -367,12 +367,25 @@ def optimize(
     axes = axes_of(runner, ranges)
     objective = _Objective(runner, metric, _cases(cases, runner), keep)
     at_once = 1 if executor is None else worker_count(executor)
-    with opened_store(store) as opened:
+    stop, was_interrupted = stop or threading.Event(), False
+    with opened_store(store) as opened, contextlib.ExitStack() as stack:
         key = None if opened is None else _key(objective, axes, direction, name)
-        with contextlib.closing(_Search(axes, runner.hyperparameters, direction, seed, at_once, opened, key)) as search:
-            was_stopped = _searched(search, objective, executor, stop or threading.Event(), n, on_trial, progress)
-            search.forget_changed()
-    result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
+        search = _Search(axes, runner.hyperparameters, direction, seed, at_once, opened, key)
+        stack.callback(search.close)
+        advance = stack.enter_context(progress_bar(progress, n, f"optimize {objective.name}", unit="trial"))
+        done = search.trials
+        advance(len(done), sum(trial.has_failed for trial in done))
+        coming = stack.enter_context(contextlib.closing(_trials(search, objective, executor, stop, n - len(done))))
+        try:
+            for trial in coming:
+                advance(1, int(trial.has_failed))
+                if on_trial is not None:
+                    on_trial(trial)
+        except KeyboardInterrupt:
+            was_interrupted = True
+        search.forget_changed()
+        was_stopped = was_interrupted or stop.is_set()
+        result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
     if result.trials and not was_stopped and len(result.failures) == len(result):
         first = result.trials[0]
         text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
@@ -400,30 +413,6 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
             return (Case(given, name=str(given)),)
         return tuple(Case(item.payload, name=item.name) for item in items_of(given, runner))
     return tuple(with_labels_read(case, runner.cg) for case in cases_of(given, are_series=bool(runner.state)))
-
-
-def _searched(
-    search: _Search,
-    objective: _Objective,
-    executor: Executor | None,
-    stop: threading.Event,
-    n: int,
-    on_trial: Callable[[Trial], object] | None,
-    progress: bool | None,
-) -> bool:
-    """Run the trials that are still to be run; return whether the search was stopped before its end."""
-    done = search.trials
-    with progress_bar(progress, n, f"optimize {objective.name}", unit="trial") as advance:
-        advance(len(done), sum(trial.value is None for trial in done))
-        try:
-            with contextlib.closing(_trials(search, objective, executor, stop, n - len(done))) as coming:
-                for trial in coming:
-                    advance(1, trial.value is None)
-                    if on_trial is not None:
-                        on_trial(trial)
-        except KeyboardInterrupt:
-            return True
-    return stop.is_set()
 
 
 def _trials(
@@ -518,29 +507,35 @@ class _Objective:
         spent_ns = sum(outcome.total_ns for outcome in outcomes.values())
         for index, outcome in sorted(outcomes.items()):
             case = self.cases[index]
-            value, failure = self._measured(case, outcome)
-            if failure:
+            try:
+                values.append(self._measure(case, outcome))
+            except _NotMeasured as error:
                 where = f"{case.name}: " if len(self.cases) > 1 and case.name else ""
-                return None, f"{where}{failure}"[:_REASON_CHARACTERS], spent_ns
-            values.append(value)
+                return None, f"{where}{error}"[:_REASON_CHARACTERS], spent_ns
         return math.fsum(values) / len(values), "", spent_ns
 
-    def _measured(self, case: Case, outcome: Outcome) -> tuple[float, str]:
-        """Return the metric of one case, and the reason if there is none."""
+    def _measure(self, case: Case, outcome: Outcome) -> float:
+        """Return the metric of one case; _NotMeasured says why there is none."""
         if outcome.error_info is not None:
-            return math.nan, str(outcome.error_info)
+            raise _NotMeasured(outcome.error_info)
         tokens, metric = MappingProxyType(dict(outcome.kept)), self.metric
         try:
             given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
         except (Exception, SystemExit) as error:
-            return math.nan, f"{self.name} raised {type(error).__name__}: {error}"
+            raise _NotMeasured(f"{self.name} raised {type(error).__name__}: {error}") from error
         if given is Nothing:
-            return math.nan, f"{self.name} gave Nothing: nothing was found"
+            raise _NotMeasured(f"{self.name} gave Nothing: nothing was found")
         try:
             value = float(given)
-        except (TypeError, ValueError, OverflowError):
-            return math.nan, f"{self.name} gave a {type(given).__name__!r}, no number"
-        return value, "" if math.isfinite(value) else f"{self.name} gave {value}"
+        except (TypeError, ValueError, OverflowError) as error:
+            raise _NotMeasured(f"{self.name} gave a {type(given).__name__!r}, no number") from error
+        if not math.isfinite(value):
+            raise _NotMeasured(f"{self.name} gave {value}")
+        return value
+
+
+class _NotMeasured(Exception):
+    """A case has no value; the text says why."""
 
 
 class _Search:
@@ -579,8 +574,7 @@ class _Search:
     ) -> None:
         with optional_import():
             import optuna
-        self._axes, self._direction = axes, direction
-        self._present, self._key = present, key
+        self._axes, self._direction, self._present, self._key = axes, direction, present, key
         self._distributions = {axis.token: axis.distribution for axis in axes}
         self._storage: optuna.storages.RDBStorage | None = None
         self._stored: optuna.Study | None = None
