@@ -29,7 +29,7 @@ State = Mapping[str, Any]
 NO_SETTING: Final[Setting] = {}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Job:
     """An item that one worker runs with some settings, one after another.
 

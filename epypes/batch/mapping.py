@@ -395,10 +395,13 @@ class _Batch:
             )
 
     def _items(self) -> Iterator[Item]:
-        for item in with_series(items_of(self.images, self.runner), self.series):
-            # How many a generator gives is known when it gives them; a map may be of any number.
-            if self.kind == "sweep" and self.images.count is None:
-                self._require_room(item.number + 1)
+        items = with_series(items_of(self.images, self.runner), self.series)
+        # How many a generator gives is known when it gives them; a map may be of any number.
+        return self._limited(items) if self.kind == "sweep" and self.images.count is None else items
+
+    def _limited(self, items: Iterator[Item]) -> Iterator[Item]:
+        for item in items:
+            self._require_room(item.number + 1)
             yield item
             # This generator waits for its caller, and must not keep the item alive meanwhile.
             del item
