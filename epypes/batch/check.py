@@ -18,12 +18,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, with_labels_read
-from epypes.batch.executors import run_jobs
-from epypes.batch.items import case_items, detached_runner, read_value
+from epypes.batch.cases import ABSENT, Case, Check, case_items, cases_of, checks_of, with_labels_read
+from epypes.batch.executors import progress_bar, run_jobs
+from epypes.batch.items import detached_runner, read_value
 from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
-from epypes.batch.progress import progress_bar
 from epypes.batch.results import BatchResult, ErrorInfo, HtmlColumn, Outcome, failure_column, frame_of, html_table
 from epypes.batch.thumbnails import DIFFERENCE_LEGEND, Thumbnail, comparison_thumbnails
 from epypes.bundle.compare import first_difference
@@ -199,12 +198,11 @@ def run_checks(
     """
 
     def jobs() -> Iterator[Job]:
-        items = case_items([case.inputs for case, _ in cases], runner)
+        items = case_items([case for case, _ in cases], runner)
         for item, (case, checks) in zip(items, cases, strict=True):
             show = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
             keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
-            named = replace(item, name=case.name or item.name)
-            yield Job(named, (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
+            yield Job(item, (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
 
     for outcomes in run_jobs(runner, jobs(), executor, stop=stop):
         for outcome in outcomes:
@@ -280,10 +278,6 @@ class CheckResult(BatchResult[CheckOutcome]):
         return f"{len(failed)} of {counted(len(cases), 'case')} failed: {named}{', ...' if len(failed) > 5 else ''}"
 
     @property
-    def _rows(self) -> tuple[CheckOutcome, ...]:
-        return self.outcomes
-
-    @property
     def _caption(self) -> str:
         failed = list(self.cases.values()).count(False)
         return f"{counted(len(self.cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}"
@@ -329,7 +323,7 @@ def _measured(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Chec
         pictures["got"] = seen
     return CheckOutcome(
         outcome.number,
-        case.name or outcome.name,
+        outcome.name,
         check.name,
         check.token,
         number,

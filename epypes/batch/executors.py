@@ -1,6 +1,7 @@
-"""Executor backends: this thread, threads, processes or a cluster run the jobs.
+"""Executor backends: this thread, threads, processes or a cluster run the jobs, and progress bars.
 
-This thread and threads run the graph itself, on runners of their own. Any other executor gets a package of it.
+This thread and threads run the graph itself, on runners of their own. Any other executor gets a package of it. Progress
+is shown as lines of text on standard error, no widgets, so that a saved notebook shows how they ended.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import abc
 import contextlib
 import os
+import sys
 import threading
 import uuid
 from collections import deque
@@ -22,6 +24,7 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any, Final
 
 from epypes.batch.job import Job, failed_outcome, read_frames, run_job
@@ -37,6 +40,7 @@ from epypes.batch.packaged_graph import (
 from epypes.batch.results import ErrorInfo, Outcome
 from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ImageFileError, ScaleError
+from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.run.runner import branched
 from epypes.wording import counted, ended
@@ -323,3 +327,49 @@ class _Processes(_Backend):
         if isinstance(found, str):
             raise ScaleError(found)
         return unpacked_outcomes(found, job)
+
+
+# -- progress -------------------------------------------------------------------------------------------------------
+
+# Takes how many more are done, and how many of these have failed.
+Advance = Callable[[int, int], None]
+
+
+@contextlib.contextmanager
+def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: str = "image") -> Iterator[Advance]:
+    """Show a bar on standard error, which a notebook shows below the cell, and yield what moves it on.
+
+    Parameters
+    ----------
+    progress
+        Whether there is one; None: in a terminal or a notebook, if tqdm is installed.
+    total
+        How many there will be; None if that is not known.
+    what
+        What is written before the bar.
+    unit
+        What is counted.
+    """
+    is_seen = find_spec("tqdm") is not None and _is_seen() if progress is None else progress
+    if not is_seen:
+        yield lambda count, failures: None
+        return
+    with optional_import():
+        from tqdm import tqdm
+    failed = 0
+    with tqdm(total=total, desc=what, unit=unit, file=sys.stderr) as bar:
+
+        def advance(count: int, failures: int) -> None:
+            nonlocal failed
+            failed += failures
+            if failures:
+                bar.set_postfix(failed=failed, refresh=False)
+            bar.update(count)
+
+        yield advance
+
+
+def _is_seen() -> bool:
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return sys.stderr is not None and (sys.stderr.isatty() or getattr(shell, "kernel", None) is not None)

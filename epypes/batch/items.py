@@ -208,7 +208,7 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     """
     given = image_set(images)
     if given.root is not None:
-        _only(runner.free_source_tokens, f"{str(given.root)!r} gives one image at a time")
+        only_token(runner.free_source_tokens, f"{str(given.root)!r} gives one image at a time")
     return _items(given, runner)
 
 
@@ -237,7 +237,7 @@ def _item(number: int, value: Any, free: tuple[str, ...], cg: CompGraph, root: P
     if isinstance(value, Item):
         return value
     if isinstance(value, Frame):
-        payload = with_images({_only(free, f"item #{number} is one frame"): value}, cg)
+        payload = with_images({only_token(free, f"item #{number} is one frame"): value}, cg)
         return Item(number, f"#{value.number}", payload, _CAMERA, value.number, value.time_s)
     if isinstance(value, Mapping):
         if value.keys() != set(free):
@@ -247,7 +247,7 @@ def _item(number: int, value: Any, free: tuple[str, ...], cg: CompGraph, root: P
     elif value is None:
         raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
     else:
-        payload = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
+        payload = {only_token(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
     frame, files = None, []
     for token, one in payload.items():
         if isinstance(one, Path):
@@ -270,7 +270,7 @@ def _file_or_value(value: Any) -> Any:
     return value
 
 
-def _only(free: tuple[str, ...], given: str) -> str:
+def only_token(free: tuple[str, ...], given: str) -> str:
     """Return the one free source token."""
     if len(free) != 1:
         tokens = ", ".join(free) or "none"
@@ -391,28 +391,6 @@ def _is_image(value: Any) -> bool:
     """Whether a value is an array of one image, and no stack of them."""
     shape = getattr(value, "shape", None)
     return isinstance(shape, tuple) and (len(shape) < 3 or (len(shape) == 3 and shape[2] in (3, 4)))
-
-
-def case_items(inputs: Iterable[Any], runner: CompGraphRunner) -> Iterator[Item]:
-    """Yield an item for the inputs of each case: of a graph with state, a series of its own.
-
-    Raises
-    ------
-    ScaleError
-        An item does not give the free source tokens.
-    """
-    if not runner.state:
-        yield from items_of(inputs, runner)
-        return
-    for number, given in enumerate(inputs):
-        if isinstance(given, str | os.PathLike) and not is_one_image(given):
-            path = os.path.abspath(Path(given).expanduser())
-            _only(runner.free_source_tokens, f"{str(given)!r} gives one image at a time")
-            yield Item(number, str(given), {}, frames=path)
-        else:
-            is_payload = is_one_image(given) or isinstance(given, Mapping)
-            frames = tuple(items_of([given] if is_payload else given, runner))
-            yield Item(number, frames[0].name if len(frames) == 1 else f"#{number}", {}, frames=frames)
 
 
 def frames_of(item: Item, runner: CompGraphRunner) -> Iterator[Item]:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cache import OutcomeCache, outcome_cache
 from epypes.batch.contact_sheet import Sheet, sheet_of, sheet_page
-from epypes.batch.executors import run_jobs, runs_here, worker_count
+from epypes.batch.executors import progress_bar, run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
 from epypes.batch.items import ImageSet, Item, SeriesKeys, detached_runner, image_set, items_of, with_series
 from epypes.batch.job import NO_SETTING, Done, Job, SeriesRuns, SharedStart, State, whole_series
-from epypes.batch.progress import progress_bar
 from epypes.batch.results import BatchResult, Outcome, outcomes_frame, outcomes_html
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
@@ -58,10 +57,6 @@ class MapResult(BatchResult[Outcome]):
         Sink tokens that are no numbers, texts or truth values stand there as a short text.
         """
         return outcomes_frame(self.outcomes, self.cg)
-
-    @property
-    def _rows(self) -> tuple[Outcome, ...]:
-        return self.outcomes
 
     @property
     def _caption(self) -> str:
@@ -118,10 +113,6 @@ class SweepResult(BatchResult[Outcome]):
             Nothing of the token was kept to be shown, or rows and columns are the same.
         """
         return sheet_of(self.runner.cg, self.outcomes, token, rows, columns)
-
-    @property
-    def _rows(self) -> tuple[Outcome, ...]:
-        return self.outcomes
 
     @property
     def _caption(self) -> str:

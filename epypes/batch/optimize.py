@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from epypes.acquisition.files import is_video_name
 from epypes.batch.cache import SearchKey
-from epypes.batch.cases import Case, cases_of, with_labels_read
-from epypes.batch.executors import run_jobs, runs_here, worker_count
+from epypes.batch.cases import Case, case_items, cases_of, with_labels_read
+from epypes.batch.executors import progress_bar, run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, ChoiceAxis, axes_of, bounded
-from epypes.batch.items import case_items, detached_runner, items_of
+from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import tokens_of
-from epypes.batch.progress import progress_bar
 from epypes.batch.results import BatchResult, Outcome, failure_column, frame_of, html_table, value_text
 from epypes.batch.thumbnails import picture_element, thumbnail_of_value
 from epypes.display.text import content, cut, cut_name
@@ -488,8 +487,7 @@ class _Objective:
             kind = type(metric).__name__
             raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
         self.runner, self.cases = runner, tuple(cases)
-        items = case_items([case.inputs for case in cases], runner)
-        self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
+        self.items = list(case_items(self.cases, runner))
         self.metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         kept = runner.cg.sink_tokens if keep is None else keep

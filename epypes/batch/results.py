@@ -191,11 +191,12 @@ class BatchResult(ShownAsPage, Sequence[_Row]):
     """The result of a map, a sweep, a check or a search: a sequence of rows that shows itself."""
 
     __slots__ = ()
+    outcomes: tuple[_Row, ...]
 
     @property
-    @abc.abstractmethod
     def _rows(self) -> tuple[_Row, ...]:
         """What it is a sequence of."""
+        return self.outcomes
 
     @property
     @abc.abstractmethod
