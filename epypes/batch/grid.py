@@ -148,10 +148,6 @@ class ChoiceAxis:
     def __str__(self) -> str:
         return " or ".join(self.labels)
 
-    def values(self) -> Sequence[Any]:
-        """Return all values."""
-        return self.choices
-
     def at(self, share: float) -> Any:
         """Return the value at a share from 0 to below 1."""
         return self.choices[int(share * len(self.choices))]
@@ -431,7 +427,8 @@ def _combined(runner: CompGraphRunner, given: Mapping[str, Any], how: str) -> tu
                 f"{name}={of_name!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
                 f"for values between two ends how='random' with n=..."
             )
-        values[name] = axis_of(runner, name, _param(runner, name, of_name)).values()
+        param = _param(runner, name, of_name)
+        values[name] = param.choices or _number_axis(runner, name, param).values()
     lengths = {name: len(of_name) for name, of_name in values.items()}
     if how == "zip" and len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())

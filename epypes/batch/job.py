@@ -143,8 +143,7 @@ def _outcome(
     album: Album,
 ) -> Outcome:
     """Run a job's item with a setting, on a payload or on the last one, and return its outcome."""
-    values = {**varied, **setting}
-    before, start_ns = runner.last, perf_counter_ns()
+    values, start_ns = {**varied, **setting}, perf_counter_ns()
     try:
         if payload is None:
             run = runner.rerun(*job.targets, **values)
@@ -153,9 +152,10 @@ def _outcome(
                 runner.set(**values)
             run = runner.run_on(payload, job.targets)
     except (Exception, SystemExit) as error:  # whatever a function raises
-        if runner.last is None or runner.last is before:
+        failed = runner.failed_run(error)
+        if failed is None:
             return failed_outcome(job.item, setting, error_info_of(error), perf_counter_ns() - start_ns)
-        run = runner.last
+        run = failed
     return _outcome_of(run, job, setting, album)
 
 
