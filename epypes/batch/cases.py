@@ -265,7 +265,7 @@ def case_items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]
         An item does not give the free source tokens.
     """
     if not runner.state:
-        items = items_of((case.inputs for case in cases), runner)
+        items = items_of([case.inputs for case in cases], runner)
         yield from (replace(item, name=case.name or "") for item, case in zip(items, cases, strict=True))
         return
     for number, case in enumerate(cases):
