@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -336,7 +336,6 @@ class _Batch:
     progress: bool | None
     state: State | None = None
     ahead: int | None = None
-    outcomes: list[Outcome] = field(default_factory=list)
 
     def run(self) -> tuple[Outcome, ...]:
         """Return the outcomes of items under settings: item by item, in each in the order of its settings."""
@@ -349,6 +348,7 @@ class _Batch:
             self._require_room(images.count or 1)
         # Where what is stored decides which series are run, the items are gone through twice.
         is_read = state is None or not (isinstance(images.values, Iterator) or isinstance(self.series, Iterator))
+        outcomes: list[Outcome] = []
         total = None if images.count is None else images.count * len(self.settings)
         with (
             outcome_cache(
@@ -359,7 +359,7 @@ class _Batch:
         ):  # fmt: skip
 
             def take(found: Sequence[Outcome]) -> None:
-                self.outcomes += found
+                outcomes.extend(found)
                 advance(len(found), sum(outcome.has_failed for outcome in found))
 
             runs = None if state is None else self._series_runs(state, cache, take)
@@ -369,7 +369,7 @@ class _Batch:
                 if cache is not None:
                     cache.add(settled)
                 take(settled)
-        return tuple(sorted(self.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
+        return tuple(sorted(outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
 
     def _require_room(self, images: int) -> None:
         """Raise ScaleError if the outcomes of a sweep, or the pictures of tokens that vary, are too many to hold."""
