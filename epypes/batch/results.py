@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, overload
 
 from epypes.batch.items import Item
 from epypes.batch.thumbnails import Thumbnail, picture_element
-from epypes.display.previews.model import Look
+from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import float_text, reason
 from epypes.display.text import content, duration_text, fitted

@@ -10,7 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.run.program import Program
 from tests.display.test_display import SVG, texts, vertices
 

@@ -11,7 +11,7 @@ import base64
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from epypes.display.previews.model import Look
+from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.text import content, cut, escape, fitted, written_length
 from epypes.errors import NotComputed
