@@ -35,7 +35,7 @@ class SheetView(anywidget.AnyWidget):
     """The contact sheet in the browser; to the kernel it sends ``ready``, ``pick`` and ``show``."""
 
     _esm = script("picker.js")
-    _css = styles("picker.css")
+    _css = styles()
 
 
 def pick(result: SweepResult, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Picker:
