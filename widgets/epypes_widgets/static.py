@@ -33,6 +33,28 @@ _FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outli
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
 
 
+class Displayed:
+    """What shows its widget in a notebook, and a static output beside it."""
+
+    _static: StaticOutput
+
+    @property
+    def widget(self) -> Any:
+        """The widget that is shown, to be put into a layout of one's own."""
+        raise NotImplementedError
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        shown = self.widget._repr_mimebundle_()
+        bundle: dict[str, Any] = (shown[0] if isinstance(shown, tuple) else shown) or {}
+        return {**bundle, "text/plain": repr(self)}
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
+
+        display(self._repr_mimebundle_(), raw=True)
+        self._static.display()
+
+
 class StaticOutput:
     """An output beside the panel, replaced from time to time.
 
