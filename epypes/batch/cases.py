@@ -39,19 +39,31 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
 from epypes.acquisition.files import is_video_name
 from epypes.acquisition.video import Video, VideoFrame
-from epypes.batch.items import by_frame, defensive_copy, holds_its_arrays, is_file, is_one_image, read_value
+from epypes.batch.items import (
+    Item,
+    VideoInput,
+    defensive_copy,
+    holds_its_arrays,
+    is_file,
+    is_one_image,
+    items_of,
+    only_token,
+    opened,
+    read_value,
+)
 from epypes.batch.metrics import METRICS
 from epypes.batch.results import short_text
 from epypes.bundle.settings import decode_value
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
+from epypes.run import CompGraphRunner
 from epypes.wording import ended
 
 # The keys of a check, besides the options of its metric.
@@ -209,18 +221,19 @@ def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
     ImageFileError
         A video can't be opened.
     """
-    if isinstance(given, Video) or (isinstance(given, str | os.PathLike) and is_video_name(Path(given))):
-        found = [Case(given)]
-    elif isinstance(given, str | os.PathLike):
+    is_path = isinstance(given, str | os.PathLike)
+    if isinstance(given, Video) or (is_path and is_video_name(Path(given))):
+        given = [given]
+    if is_path and not isinstance(given, list):
         found = _read_file(Path(given), are_series)
     elif isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(
             f"cases is a list of cases or the path of a file of them, not a single {type(given).__name__!r}."
         )
+    elif holds_its_arrays(given):
+        found = [_case(item, are_series) for item in given]
     else:
-        found = [
-            _case(item, are_series) if holds_its_arrays(given) else _copied(_case(item, are_series)) for item in given
-        ]
+        found = [_copied(_case(item, are_series)) for item in given]
     if not found:
         raise ScaleError("There are no cases. Give at least one: ep.Case(inputs, expected={...}).")
     if not are_series:
@@ -234,12 +247,35 @@ def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
 
 def _by_frame(case: Case) -> Iterator[Case]:
     """Yield a case, or, of one with a video, a case for each frame."""
-    for inputs in by_frame(case.inputs):
-        if inputs is case.inputs:
-            yield case
+    given = opened(case.inputs)
+    if not isinstance(given, VideoInput):
+        yield case
+        return
+    for inputs in given:
+        frame = next(value for value in _values(inputs) if isinstance(value, VideoFrame))
+        yield replace(case, inputs=inputs, name=f"{case.name} #{frame.number}" if case.name else frame.name)
+
+
+def case_items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]:
+    """Yield an item for each case of ``cases_of``, with its name: of a graph with state, a series of its own.
+
+    Raises
+    ------
+    ScaleError
+        An item does not give the free source tokens.
+    """
+    if not runner.state:
+        items = items_of([case.inputs for case in cases], runner)
+        yield from (replace(item, name=case.name or "") for item, case in zip(items, cases, strict=True))
+        return
+    for number, case in enumerate(cases):
+        given, name = case.inputs, case.name or ""
+        if isinstance(given, str | os.PathLike) and not is_one_image(given):
+            only_token(runner.free_source_tokens, f"{str(given)!r} gives one image at a time")
+            yield Item(number, name, {}, frames=os.path.abspath(Path(given).expanduser()))
         else:
-            frame = next(value for value in _values(inputs) if isinstance(value, VideoFrame))
-            yield replace(case, inputs=inputs, name=f"{case.name} #{frame.number}" if case.name else frame.name)
+            is_payload = is_one_image(given) or isinstance(given, Mapping)
+            yield Item(number, name, {}, frames=tuple(items_of([given] if is_payload else given, runner)))
 
 
 def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:

@@ -18,13 +18,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, with_labels_read
-from epypes.batch.executors import run_jobs
-from epypes.batch.items import case_items, detached_runner, read_value
+from epypes.batch.cases import ABSENT, Case, Check, case_items, cases_of, checks_of, with_labels_read
+from epypes.batch.executors import progress_bar, run_jobs
+from epypes.batch.items import detached_runner, read_value
 from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
-from epypes.batch.progress import progress_bar
-from epypes.batch.results import ErrorInfo, Outcome, frame_of, html_table, object_column
+from epypes.batch.results import BatchResult, ErrorInfo, HtmlColumn, Outcome, failure_column, frame_of, html_table
 from epypes.batch.thumbnails import DIFFERENCE_LEGEND, Thumbnail, comparison_thumbnails
 from epypes.bundle.compare import first_difference
 from epypes.bundle.settings import Member
@@ -85,6 +84,11 @@ class CheckOutcome:
     def passed(self) -> bool:
         """Whether the check has passed."""
         return not self.reason
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether the check has not passed."""
+        return bool(self.reason)
 
 
 def check(
@@ -194,12 +198,11 @@ def run_checks(
     """
 
     def jobs() -> Iterator[Job]:
-        items = case_items([case.inputs for case, _ in cases], runner)
+        items = case_items([case for case, _ in cases], runner)
         for item, (case, checks) in zip(items, cases, strict=True):
             show = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
             keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
-            named = replace(item, name=case.name or item.name)
-            yield Job(named, (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
+            yield Job(item, (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
 
     for outcomes in run_jobs(runner, jobs(), executor, stop=stop):
         for outcome in outcomes:
@@ -208,7 +211,7 @@ def run_checks(
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class CheckResult:
+class CheckResult(BatchResult[CheckOutcome]):
     """The result of a labelled set; true if all of it has passed.
 
     Attributes
@@ -222,12 +225,7 @@ class CheckResult:
     @property
     def passed(self) -> bool:
         """Whether every check of every case has passed."""
-        return all(outcome.passed for outcome in self.outcomes)
-
-    @property
-    def failures(self) -> tuple[CheckOutcome, ...]:
-        """The checks that have not passed."""
-        return tuple(outcome for outcome in self.outcomes if not outcome.passed)
+        return not self.failures
 
     @property
     def cases(self) -> dict[str, bool]:
@@ -240,17 +238,14 @@ class CheckResult:
     def to_frame(self) -> pd.DataFrame:
         """Return a pandas table with a row per check: case, check, token, value, threshold, passed, failure, run_ms."""
         outcomes = self.outcomes
-        columns = {
-            "case": [outcome.case for outcome in outcomes],
-            "check": [outcome.check for outcome in outcomes],
-            "token": [outcome.token for outcome in outcomes],
-            "value": [float("nan") if outcome.value is None else outcome.value for outcome in outcomes],
-            "threshold": [outcome.threshold for outcome in outcomes],
-            "passed": [outcome.passed for outcome in outcomes],
-            "failure": object_column([outcome.reason or None for outcome in outcomes]),
-            "run_ms": [outcome.total_ns / 1e6 for outcome in outcomes],
-        }
-        return frame_of(columns)
+        columns = [
+            (name, [getattr(outcome, name) for outcome in outcomes], "")
+            for name in ("case", "check", "token", "value", "threshold", "passed")
+        ]
+        # As numbers, even if there is none.
+        columns[3] = "value", [math.nan if outcome.value is None else outcome.value for outcome in outcomes], ""
+        failure = failure_column(outcome.reason for outcome in outcomes)
+        return frame_of([*columns, failure, ("run_ms", [outcome.total_ns / 1e6 for outcome in outcomes], "")])
 
     def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:
         """Write JUnit XML, as continuous integration reads it, and return its path.
@@ -274,9 +269,6 @@ class CheckResult:
     def __bool__(self) -> bool:
         return self.passed
 
-    def __len__(self) -> int:
-        return len(self.outcomes)
-
     def __str__(self) -> str:
         cases = self.cases
         failed = [name for name, has_passed in cases.items() if not has_passed]
@@ -285,27 +277,23 @@ class CheckResult:
         named = ", ".join(failed[:5])
         return f"{len(failed)} of {counted(len(cases), 'case')} failed: {named}{', ...' if len(failed) > 5 else ''}"
 
-    def __repr__(self) -> str:
-        cases = self.cases
-        failed = sum(not passed for passed in cases.values())
-        return f"<CheckResult: {counted(len(cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}>"
+    @property
+    def _caption(self) -> str:
+        failed = list(self.cases.values()).count(False)
+        return f"{counted(len(self.cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}"
 
-    def _repr_html_(self) -> str:
-        kinds = ("expected", "got", "difference")
-        pictured = [kind for kind in kinds if any(kind in outcome.pictures for outcome in self.outcomes)]
-        rows = [
-            (
-                outcome.case,
-                outcome.check,
-                "" if outcome.value is None else f"{outcome.value:.6g}",
-                outcome.threshold,
-                *(outcome.pictures.get(kind) for kind in pictured),
-            )
-            for outcome in self.outcomes
+    def _page(self) -> str:
+        outcomes, kinds = self.outcomes, ("expected", "got", "difference")
+        pictured = [kind for kind in kinds if any(kind in outcome.pictures for outcome in outcomes)]
+        columns: list[HtmlColumn] = [
+            ("case", [outcome.case for outcome in outcomes]),
+            ("check", [outcome.check for outcome in outcomes]),
+            ("value", ["" if outcome.value is None else f"{outcome.value:.6g}" for outcome in outcomes]),
+            ("must be", [outcome.threshold for outcome in outcomes]),
+            *((kind, [outcome.pictures.get(kind) for outcome in outcomes]) for kind in pictured),
         ]
-        head, failures = ("case", "check", "value", "must be", *pictured), [one.reason for one in self.outcomes]
         legend = f"<p>difference of masks: {DIFFERENCE_LEGEND}</p>" if "difference" in pictured else ""
-        return html_table(str(self), head, rows, failures) + legend
+        return html_table(str(self), columns, [outcome.reason for outcome in outcomes]) + legend
 
 
 # -- measuring --------------------------------------------------------------------------------------------------
@@ -335,7 +323,7 @@ def _measured(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Chec
         pictures["got"] = seen
     return CheckOutcome(
         outcome.number,
-        case.name or outcome.name,
+        outcome.name,
         check.name,
         check.token,
         number,

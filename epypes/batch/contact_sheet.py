@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Final
 
 from epypes.batch.grid import identity
-from epypes.batch.results import Outcome, short_text
-from epypes.batch.thumbnails import Thumbnail, data_uri, smaller
-from epypes.display.previews.short import reason
-from epypes.display.text import CHARACTERS, THUMBNAIL_CHARACTERS, content, escape, fitted, size
+from epypes.batch.results import Outcome, ShownAsPage, short_text
+from epypes.batch.thumbnails import Thumbnail, picture_element, smaller
+from epypes.display.text import CHARACTERS, THUMBNAIL_CHARACTERS, content, fitted, size
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.wording import counted
@@ -61,8 +60,8 @@ class Block:
     rows: tuple[tuple[Cell, ...], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
+@dataclass(frozen=True, slots=True, repr=False)
+class Sheet(ShownAsPage):
     """The outcomes of a sweep as pictures side by side; shows itself.
 
     Attributes
@@ -103,11 +102,8 @@ class Sheet:
         failed = sum(tile.has_failed for tile in tiles)
         return f"<Sheet of {str(self.token)!r:.30}: {counted(len(tiles), 'outcome')}, {failed} failed>"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        try:
-            return {"text/plain": repr(self), "text/html": sheet_page(self)}
-        except Exception as error:  # a notebook shows the result whatever is wrong with its pictures
-            return {"text/plain": f"{self!r}\n(no picture: {reason(error)})"}
+    def _page(self) -> str:
+        return sheet_page(self)
 
 
 # -- the layout -------------------------------------------------------------------------------------------------
@@ -329,6 +325,5 @@ def _paint_cell(tag: str, tiles: Cell, most_bytes: int, chosen: int | None) -> s
             mark = "<b>failed</b> " * tile.has_failed
             painted += f"{label}<span>{mark}{content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
         else:
-            alt = escape(fitted(tile.text, _LABEL_ROOM))
-            painted += f'<img src="{data_uri(picture)}" alt="{alt}" title="{alt}">{label}'
+            painted += f"{picture_element(picture, tile.text, _LABEL_ROOM)}{label}"
     return f'<{tag} class="cell{state}">{painted}</{tag}>'

@@ -1,12 +1,15 @@
-"""Executor backends: this thread, threads, processes or a cluster run the jobs.
+"""Executor backends: this thread, threads, processes or a cluster run the jobs, and progress bars.
 
-This thread and threads run the graph itself, on runners of their own. Any other executor gets a package of it.
+This thread and threads run the graph itself, on runners of their own. Any other executor gets a package of it. Progress
+is shown as lines of text on standard error, no widgets, so that a saved notebook shows how they ended.
 """
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import os
+import sys
 import threading
 import uuid
 from collections import deque
@@ -21,9 +24,10 @@ from concurrent.futures import (
     wait,
 )
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any, Final
 
-from epypes.batch.job import Job, failed_outcomes, read_frames, run_job
+from epypes.batch.job import Job, failed_outcome, read_frames, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
     PackagedJob,
@@ -36,6 +40,7 @@ from epypes.batch.packaged_graph import (
 from epypes.batch.results import ErrorInfo, Outcome
 from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ImageFileError, ScaleError
+from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.run.runner import branched
 from epypes.wording import counted, ended
@@ -118,12 +123,16 @@ class _FilesMissing(Exception):
     """The worker process that got a job has not unpacked the package yet."""
 
 
+class _RunHere(Exception):
+    """The executor's processes can't get the graph before an item could be run."""
+
+
 class _WorkersKilled(Exception):
     """Every worker process that ran a job died, and the cluster has given it up."""
 
 
 def _run_in_flight(
-    backend: _Threads | _Processes, jobs: Iterable[Job | None], most: int, over: threading.Event, stop: threading.Event
+    backend: _Backend, jobs: Iterable[Job | None], most: int, over: threading.Event, stop: threading.Event
 ) -> Iterator[list[Outcome]]:
     """Keep so many jobs in flight; yield what comes; leave none behind, however it ends."""
     in_flight: dict[Future[Any], Job] = {}
@@ -153,7 +162,7 @@ def _run_in_flight(
                     if job is not alone:
                         isolated.append(job)
                         continue
-                    outcomes = failed_outcomes(job.item, job.settings, _KILLED)
+                    outcomes = [failed_outcome(job.item, setting, _KILLED) for setting in job.settings]
                 done += len(outcomes)
                 yield outcomes
         over.set()
@@ -166,7 +175,7 @@ def _run_in_flight(
             future.cancel()
 
 
-def _last_outcomes(backend: _Threads | _Processes, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
+def _last_outcomes(backend: _Backend, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
     """Yield the outcomes of jobs that have begun; no other begins any more."""
     ready, _ = wait({future for future in in_flight if not future.cancel()}, _GRACE_S)
     for future in ready:
@@ -211,51 +220,64 @@ def worker_count(executor: Executor) -> int:
         raise ExecutorBroken(0, _broken_text(0, _SubmitRefused(_error_text(error)))) from error
 
 
-def _submitted(executor: Executor, call: Callable[..., Any], argument: object) -> Future[Any]:
-    try:
-        return executor.submit(call, argument)
-    except BrokenExecutor:
-        raise
-    except Exception as error:  # Python's pools raise RuntimeError, others what they like
-        raise _SubmitRefused(_error_text(error)) from error
-
-
-def _done(outcomes: list[Outcome]) -> Future[Any]:
-    """Return the future of a job that was run in this thread, as one whose input can't be read."""
-    done: Future[Any] = Future()
-    done.set_result(outcomes)
-    return done
-
-
 # -- backends -------------------------------------------------------------------------------------------------------
 
 
-class _Threads:
-    """Threads of this process: each job on a runner that no other thread uses meanwhile.
+class _Backend(abc.ABC):
+    """Where jobs are run that are in flight.
 
     Parameters
     ----------
     runner
         Its graph and hyperparameters are used.
     executor
-        The threads.
-    stops
-        Once one of them is set, no job is begun any more, and jobs that were begun end with the item that is being run.
+        Runs the jobs.
+    """
+
+    def __init__(self, runner: CompGraphRunner, executor: Executor) -> None:
+        self.runner, self._executor = clone_runner(runner), executor
+
+    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
+        """Give a job to the executor; one whose frames can't be read, or that can't go there yet, is run here."""
+        try:
+            call, argument = self.call_of(job, with_files)
+        except (ImageFileError, _RunHere):
+            done: Future[Any] = Future()
+            done.set_result(list(run_job(branched(self.runner), job)))
+            return done
+        try:
+            return self._executor.submit(call, argument)
+        except BrokenExecutor:
+            raise
+        except Exception as error:  # Python's pools raise RuntimeError, others what they like
+            raise _SubmitRefused(_error_text(error)) from error
+
+    @abc.abstractmethod
+    def call_of(self, job: Job, with_files: bool) -> tuple[Callable[[Any], Any], Any]:
+        """Return what the executor calls, and with which argument."""
+
+    @abc.abstractmethod
+    def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
+        """Return the outcomes of a job that has ended."""
+
+
+class _Threads(_Backend):
+    """Threads of this process: each job on a runner that no other thread uses meanwhile.
+
+    ``stops``: once one of them is set, no job is begun any more, and jobs that were begun end with the item that is
+    being run.
     """
 
     def __init__(self, runner: CompGraphRunner, executor: Executor, stops: Sequence[threading.Event]) -> None:
-        self._runner, self._executor, self._stops = clone_runner(runner), executor, stops
+        super().__init__(runner, executor)
+        self._stops = stops
 
-    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
-        """Give a job to a thread."""
-        try:
-            return _submitted(self._executor, self._run, read_frames(job, self._runner.cg))
-        except ImageFileError:
-            return _done(list(run_job(branched(self._runner), job)))
+    def call_of(self, job: Job, with_files: bool) -> tuple[Callable[[Any], Any], Any]:
+        return self._run, read_frames(job, self.runner.cg)
 
     def _run(self, job: Job) -> list[Outcome]:
         outcomes: list[Outcome] = []
-        waiting = run_job(branched(self._runner), job, self._is_over)
+        waiting = run_job(branched(self.runner), job, self._is_over)
         while not self._is_over() and (outcome := next(waiting, None)) is not None:
             outcomes.append(outcome)
         return outcomes
@@ -264,56 +286,42 @@ class _Threads:
         return any(stop.is_set() for stop in self._stops)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
-        """Return the outcomes of a job."""
         outcomes: list[Outcome] = future.result()
         return outcomes
 
 
-class _Processes:
+class _Processes(_Backend):
     """Other processes, on this machine or others, which get a package of the graph.
 
     Until an item could be run, whose values prove the package, jobs run in this thread.
-
-    Parameters
-    ----------
-    runner
-        Its graph and hyperparameters are used.
-    executor
-        Any executor whose workers are processes.
     """
 
     def __init__(self, runner: CompGraphRunner, executor: Executor) -> None:
-        self._runner, self._executor = clone_runner(runner), executor
-        self._hyperparameters = packed_values(self._runner.hyperparameters, "Hyperparameter")
+        super().__init__(runner, executor)
+        self._hyperparameters = packed_values(self.runner.hyperparameters, "Hyperparameter")
+        self._options = tuple((name, getattr(runner, name)) for name in ("workers", "guard", "check_mutation"))
         self._package: PackagedGraph | None = None
 
-    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
-        """Send a job to a worker process."""
-        package = self._package = self._package or package_of(self._runner, job.item)
+    def call_of(self, job: Job, with_files: bool) -> tuple[Callable[[Any], Any], Any]:
+        package = self._package = self._package or package_of(self.runner, job.item)
         if package is None:
-            return _done(list(run_job(clone_runner(self._runner), job)))
-        try:
-            job = read_frames(job, self._runner.cg, of_cases=True)
-        except ImageFileError:
-            return _done(list(run_job(clone_runner(self._runner), job)))
+            raise _RunHere
+        packed = packed_job(read_frames(job, self.runner.cg, of_cases=True))
         # A worker process that has not unpacked the package yet asks for its files.
         package = package if with_files else replace(package, files=None)
-        runner = self._runner
-        options = tuple((name, getattr(runner, name)) for name in ("workers", "guard", "check_mutation"))
-        packaged = PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed_job(job), options)
-        return _submitted(self._executor, run_packaged_job, packaged)
+        return run_packaged_job, PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed, self._options)
 
     def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
-        """Return the outcomes of a job that came back."""
         try:
             found = future.result()
-        except (BrokenExecutor, CancelledError):
+        except (BrokenExecutor, CancelledError, EpypesError):
             raise
         except Exception as error:
             # By its name, since this module does not import Dask.
             if type(error).__name__ == "KilledWorker":
                 raise _WorkersKilled from error
-            raise _job_error(error) from error
+            needed = "Workers need epypes, of the same version, and what the graph imports."
+            raise ScaleError(f"A worker could not do its job: {ended(_error_text(error))} {needed}") from error
         if found is None:
             raise _FilesMissing
         if isinstance(found, str):
@@ -321,8 +329,47 @@ class _Processes:
         return unpacked_outcomes(found, job)
 
 
-def _job_error(error: Exception) -> EpypesError:
-    if isinstance(error, EpypesError):
-        return error
-    needed = "Workers need epypes, of the same version, and what the graph imports."
-    return ScaleError(f"A worker could not do its job: {ended(_error_text(error))} {needed}")
+# -- progress -------------------------------------------------------------------------------------------------------
+
+# Takes how many more are done, and how many of these have failed.
+Advance = Callable[[int, int], None]
+
+
+@contextlib.contextmanager
+def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: str = "image") -> Iterator[Advance]:
+    """Show a bar on standard error, which a notebook shows below the cell, and yield what moves it on.
+
+    Parameters
+    ----------
+    progress
+        Whether there is one; None: in a terminal or a notebook, if tqdm is installed.
+    total
+        How many there will be; None if that is not known.
+    what
+        What is written before the bar.
+    unit
+        What is counted.
+    """
+    is_seen = find_spec("tqdm") is not None and _is_seen() if progress is None else progress
+    if not is_seen:
+        yield lambda count, failures: None
+        return
+    with optional_import():
+        from tqdm import tqdm
+    failed = 0
+    with tqdm(total=total, desc=what, unit=unit, file=sys.stderr) as bar:
+
+        def advance(count: int, failures: int) -> None:
+            nonlocal failed
+            failed += failures
+            if failures:
+                bar.set_postfix(failed=failed, refresh=False)
+            bar.update(count)
+
+        yield advance
+
+
+def _is_seen() -> bool:
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return sys.stderr is not None and (sys.stderr.isatty() or getattr(shell, "kernel", None) is not None)

@@ -1,10 +1,16 @@
-"""Jobs: an item and the settings with which one worker runs it, and how it runs them."""
+"""Jobs: an item and the settings with which one worker runs it, how it runs them, and which can run next.
+
+The items of a graph with state run in order, each with the state that the one before it in its series has left.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from time import perf_counter_ns
 from typing import Any, Final
 
@@ -12,7 +18,7 @@ from epypes.acquisition.video import VideoFrame
 from epypes.batch.items import Item, frames_of, payload_of, read_value
 from epypes.batch.results import ErrorInfo, Outcome, short_value
 from epypes.batch.thumbnails import Album
-from epypes.errors import EpypesError, ScaleError
+from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
@@ -23,7 +29,7 @@ State = Mapping[str, Any]
 NO_SETTING: Final[Setting] = {}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Job:
     """An item that one worker runs with some settings, one after another.
 
@@ -73,41 +79,32 @@ def run_job(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool] = lam
 
 def _run_with_state(runner: CompGraphRunner, job: Job, is_over: Callable[[], bool]) -> Iterator[Outcome]:
     """Run the item, or its frames one after another, from the beginning for each setting; give the last outcomes."""
-    for place, setting in enumerate(job.settings):
-        outcome = _outcome_with_state(runner, job, setting, job.states[place] if job.states else {}, is_over)
-        if outcome is None:
-            return
-        yield outcome
-
-
-def _outcome_with_state(
-    runner: CompGraphRunner, job: Job, setting: Setting, state: State, is_over: Callable[[], bool]
-) -> Outcome | None:
-    item, total_ns, last = job.item, 0, None
-    try:
-        for place, frame in enumerate(frames_of(item, runner)):
-            if is_over():
-                return None
-            last = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
-            total_ns += last.report.total_ns
-            state = last.state
-            if last.failure is not None:
-                if not isinstance(last.failure.exception, Exception | SystemExit):  # Ctrl+C ends the map
-                    raise last.failure.exception
-                where = "" if item.frames is None else f" (frame {place}: {frame.name})"
-                return _outcome_of(last, job, setting, Album(), total_ns, state, where)
-        if last is None:
-            raise ScaleError(f"{item.name} has no frames. Give one at least.")
-    except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
-        (failed,) = failed_outcomes(item, [setting], ErrorInfo("", type(error).__name__, str(error)))
-        return replace(failed, state=state)
-    return _outcome_of(last, job, setting, Album(), total_ns, state)
+    item = job.item
+    for setting, state in zip_longest(job.settings, job.states, fillvalue=NO_SETTING):
+        total_ns, where = 0, ""
+        try:
+            for place, frame in enumerate(frames_of(item, runner)):
+                if is_over():
+                    return
+                run = runner.trial(setting, *job.targets, payload=payload_of(frame, runner.cg), state=state)
+                total_ns, state = total_ns + run.report.total_ns, run.state
+                if run.failure is not None:
+                    where = "" if item.frames is None else f" (frame {place}: {frame.name})"
+                    break
+        except (Exception, SystemExit) as error:  # what a file can't give, or no payload is
+            yield replace(failed_outcome(item, setting, error_info_of(error)), state=state)
+            continue
+        if run.failure is not None and not isinstance(run.failure.exception, Exception | SystemExit):
+            raise run.failure.exception  # Ctrl+C ends the map
+        yield _outcome_of(run, job, setting, Album(), total_ns, state, where)
 
 
 def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
-    item, start, now = job.item, job.start or SharedStart(), runner.hyperparameters
+    """Run the item with the first setting, then only what depends on what changes from setting to setting."""
+    item, start, now = job.item, job.start, runner.hyperparameters
     # A setting may leave out what another one has: that is then as it was.
     varied = {token: now[token] for setting in job.settings for token in setting if token in now}
+    album = start.album if start is not None else Album()
     waiting, begun = iter(job.settings), list[Outcome]()
 
     def begin() -> CompGraphRunner | None:
@@ -116,30 +113,103 @@ def _run_without_state(runner: CompGraphRunner, job: Job) -> Iterator[Outcome]:
         try:
             payload = payload_of(item, runner.cg)
         except (EpypesError, OSError) as error:
-            begun.extend(failed_outcomes(item, waiting, ErrorInfo("", type(error).__name__, str(error))))
+            begun.extend(failed_outcome(item, setting, error_info_of(error)) for setting in waiting)
             return None
         for setting in waiting:
-            begun.append(_outcome(runner, job, setting, varied, payload, start.album))
+            begun.append(_outcome(runner, job, setting, varied, payload, album))
             if runner.last is not before:
                 return runner
         return None
 
     try:
-        own = begin() if job.start is None else start.branch(begin)
+        own = begin() if start is None else start.branch(begin)
         yield from begun
         if own is not None:
             for setting in waiting:
-                yield _outcome(own, job, setting, varied, None, start.album)
-            if job.start is not None:
+                yield _outcome(own, job, setting, varied, None, album)
+            if start is not None:
                 start.move_to(own)
     finally:
         if varied:
             runner.set(**varied)
 
 
-def failed_outcomes(item: Item, settings: Iterable[Setting], error_info: ErrorInfo) -> list[Outcome]:
-    """Return the outcomes of an item that could not be run, for each of its settings."""
-    return [_blank(item, setting, error_info) for setting in settings]
+def _outcome(
+    runner: CompGraphRunner,
+    job: Job,
+    setting: Setting,
+    varied: Setting,
+    payload: Mapping[str, Any] | None,
+    album: Album,
+) -> Outcome:
+    """Run a job's item with a setting, on a payload or on the last one, and return its outcome."""
+    values, start_ns = {**varied, **setting}, perf_counter_ns()
+    try:
+        if payload is None:
+            run = runner.rerun(*job.targets, **values)
+        else:
+            if values:
+                runner.set(**values)
+            run = runner.run_on(payload, job.targets)
+    except (Exception, SystemExit) as error:  # whatever a function raises
+        failed = runner.failed_run(error)
+        if failed is None:
+            return failed_outcome(job.item, setting, error_info_of(error), perf_counter_ns() - start_ns)
+        run = failed
+    return _outcome_of(run, job, setting, album)
+
+
+def _outcome_of(
+    run: Run, job: Job, setting: Setting, album: Album, total_ns: int = 0, state: State = NO_SETTING, where: str = ""
+) -> Outcome:
+    """Return the outcome of a run.
+
+    Parameters
+    ----------
+    total_ns
+        Of the runs before it too; 0: its own.
+    state
+        What it has left.
+    where
+        Is added to the message of a failure.
+    """
+    item, report, tokens, failure = job.item, run.report, run.tokens, run.failure
+    values, nothing = dict[str, Any](), []
+    for token in run.cg.sink_tokens:
+        if tokens.is_readable(token):
+            if tokens.is_nothing(token):
+                nothing.append(token)
+            else:
+                values[token] = short_value(run[token])
+    thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
+    return Outcome(
+        item.number,
+        item.name,
+        setting,
+        values,
+        report.durations_ns,
+        total_ns or report.total_ns,
+        None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
+        thumbnails,
+        {token: run[token] for token in job.keep if tokens.is_readable(token)},
+        texts,
+        tuple(nothing),
+        item.frame,
+        item.time_s,
+        item.series,
+        state,
+    )
+
+
+def failed_outcome(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
+    """Return the outcome of an item that could not be run with a setting, so that it has no values."""
+    outcome = Outcome(item.number, item.name, setting, total_ns=total_ns, error_info=error_info)
+    return replace(outcome, frame=item.frame, time_s=item.time_s, series=item.series)
+
+
+def error_info_of(error: BaseException) -> ErrorInfo:
+    """Return what failed where no function of the graph did."""
+    return ErrorInfo("", type(error).__name__, str(error))
 
 
 def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:
@@ -159,96 +229,16 @@ def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:
     ImageFileError
         A frame is damaged.
     """
-    item = _with_pixels(job.item, cg)
+
+    def with_pixels(item: Item) -> Item:
+        frames = {token: value for token, value in item.payload.items() if isinstance(value, VideoFrame)}
+        read = {token: read_value(frame, cg, token) for token, frame in frames.items()}
+        return replace(item, payload={**item.payload, **read}) if read else item
+
+    item = with_pixels(job.item)
     if of_cases and isinstance(item.frames, tuple):
-        item = replace(item, frames=tuple(_with_pixels(frame, cg) for frame in item.frames))
+        item = replace(item, frames=tuple(map(with_pixels, item.frames)))
     return job if item is job.item else replace(job, item=item)
-
-
-def _with_pixels(item: Item, cg: CompGraph) -> Item:
-    if not any(isinstance(value, VideoFrame) for value in item.payload.values()):
-        return item
-    read = {
-        token: read_value(value, cg, token) if isinstance(value, VideoFrame) else value
-        for token, value in item.payload.items()
-    }
-    return replace(item, payload=read)
-
-
-def _blank(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:
-    """Return the outcome of an item that has no values."""
-    return Outcome(
-        item.number,
-        item.name,
-        setting,
-        total_ns=total_ns,
-        error_info=error_info,
-        frame=item.frame,
-        time_s=item.time_s,
-        series=item.series,
-    )
-
-
-def _outcome(
-    runner: CompGraphRunner,
-    job: Job,
-    setting: Setting,
-    varied: Setting,
-    payload: Mapping[str, Any] | None,
-    album: Album,
-) -> Outcome:
-    """Run a job's item with a setting, on a payload or on the last one, and return its outcome."""
-    item, values = job.item, {**varied, **setting}
-    before, start_ns = runner.last, perf_counter_ns()
-    try:
-        if payload is None:
-            run = runner.rerun(*job.targets, **values)
-        else:
-            if values:
-                runner.set(**values)
-            run = runner.run_on(payload, job.targets)
-    except (Exception, SystemExit) as error:  # whatever a function raises
-        if runner.last is None or runner.last is before:
-            info = ErrorInfo("", type(error).__name__, str(error))
-            return _blank(item, setting, info, perf_counter_ns() - start_ns)
-        run = runner.last
-    return _outcome_of(run, job, setting, album)
-
-
-def _outcome_of(
-    run: Run, job: Job, setting: Setting, album: Album, total_ns: int = 0, state: State = NO_SETTING, where: str = ""
-) -> Outcome:
-    """Return the outcome of a run.
-
-    Parameters
-    ----------
-    total_ns
-        Of the runs before it too; 0: its own.
-    state
-        What it has left.
-    where
-        Is added to the message of a failure.
-    """
-    item, report, tokens, failure = job.item, run.report, run.tokens, run.failure
-    sinks = [token for token in run.cg.sink_tokens if tokens.is_readable(token)]
-    thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
-    return Outcome(
-        item.number,
-        item.name,
-        setting,
-        {token: short_value(run[token]) for token in sinks if not tokens.is_nothing(token)},
-        report.durations_ns,
-        total_ns or report.total_ns,
-        None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
-        thumbnails,
-        {token: run[token] for token in job.keep if tokens.is_readable(token)},
-        texts,
-        nothing=tuple(filter(tokens.is_nothing, sinks)),
-        series=item.series,
-        state=state,
-        frame=item.frame,
-        time_s=item.time_s,
-    )
 
 
 class SharedStart:
@@ -293,3 +283,144 @@ class SharedStart:
         """Let the next job branch from this runner's last run."""
         with self._lock:
             self._runner = branched(runner)
+
+
+# -- series -----------------------------------------------------------------------------------------------------
+
+# A series and a setting of it, by identity.
+Done = tuple[Hashable, int]
+
+
+@dataclass(slots=True, eq=False)
+class _Chain:
+    """Runs of one series with some settings: one item at a time.
+
+    Attributes
+    ----------
+    job
+        Has the settings with which each item is run, and the states that the next item begins with.
+    waiting
+        The items that have not begun.
+    pending
+        How many outcomes of the item that runs are still to come.
+    """
+
+    job: Job
+    waiting: deque[Item] = field(default_factory=deque)
+    pending: int = 0
+
+
+class SeriesRuns:
+    """What can be run now of several series: iterate over it to get jobs.
+
+    Series, and the parts of the settings, run side by side. Where all items that have come wait for others of their
+    series, None is given: report outcomes, then iterate on.
+
+    Parameters
+    ----------
+    items
+        With the keys of their series; taken one by one.
+    parts
+        A job for each part of the settings, whose item and states are still to be set; parts run side by side.
+    state
+        What each series begins with.
+    room
+        How many items are taken ahead at most, for series that are busy.
+    done
+        The series and settings that are not run, since their outcomes are known: key, ``id(setting)``.
+    """
+
+    def __init__(
+        self,
+        items: Iterable[Item],
+        parts: Sequence[Job],
+        state: State,
+        room: float,
+        done: AbstractSet[Done] = frozenset(),
+    ) -> None:
+        self._items, self._parts, self._state = iter(items), parts, state
+        self._room, self._done = room * len(parts), done
+        self._chains: dict[Hashable, list[_Chain]] = {}
+        self._ready: deque[_Chain] = deque()
+        self._waiting = 0
+        self._running: dict[tuple[int, int], tuple[_Chain, int]] = {}
+
+    def __iter__(self) -> Iterator[Job | None]:
+        is_over = False
+        while True:
+            while not (self._ready or is_over) and self._waiting < self._room:
+                item = next(self._items, None)
+                is_over = item is None
+                if item is not None:
+                    self._take(item)
+                del item
+            if self._ready:
+                yield self._begin(self._ready.popleft())
+            elif is_over and not self._waiting:
+                return
+            else:
+                yield None
+
+    def _take(self, item: Item) -> None:
+        if item.series not in self._chains:
+            chains = self._chains[item.series] = []
+            for part in self._parts:
+                left = tuple(one for one in part.settings if (item.series, id(one)) not in self._done)
+                if left:
+                    chains.append(_Chain(replace(part, settings=left, states=(self._state,) * len(left))))
+        for chain in self._chains[item.series]:
+            chain.waiting.append(item)
+            self._waiting += 1
+            if not chain.pending and len(chain.waiting) == 1:
+                self._ready.append(chain)
+
+    def _begin(self, chain: _Chain) -> Job:
+        job = replace(chain.job, item=chain.waiting.popleft())
+        self._waiting -= 1
+        chain.pending = len(job.settings)
+        for place, setting in enumerate(job.settings):
+            self._running[job.item.number, id(setting)] = chain, place
+        return job
+
+    def settle(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
+        """Take what has been run: the next item of its series can begin; return the outcomes without their states."""
+        settled = []
+        for outcome in outcomes:
+            chain, place = self._running.pop((outcome.number, id(outcome.setting)))
+            if outcome.state:  # what could not be run at all has left none
+                states = chain.job.states
+                chain.job = replace(chain.job, states=(*states[:place], outcome.state, *states[place + 1 :]))
+            chain.pending -= 1
+            if not chain.pending and chain.waiting:
+                self._ready.append(chain)
+            settled.append(replace(outcome, state={}))
+        return settled
+
+
+def whole_series(
+    items: Iterable[Item], settings: Sequence[Setting], found: Callable[[Item], list[Outcome | None]]
+) -> tuple[list[Outcome], frozenset[Done]]:
+    """Return the outcomes of the series of which all are known, and which these are.
+
+    A series of which some are missing is run from its beginning, since the state amid it is not stored.
+
+    Parameters
+    ----------
+    items
+        With the keys of their series.
+    settings
+        With which they are run.
+    found
+        Returns the known outcomes of an item, by setting.
+    """
+    columns: dict[Done, list[Outcome]] = {}
+    missing: set[Done] = set()
+    for item in items:
+        for setting, outcome in zip(settings, found(item), strict=True):
+            key = item.series, id(setting)
+            if outcome is None:
+                missing.add(key)
+                columns.pop(key, None)
+            elif key not in missing:
+                columns.setdefault(key, []).append(outcome)
+    return [outcome for column in columns.values() for outcome in column], frozenset(columns)

@@ -5,31 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.acquisition.video import Video
 from epypes.batch.cache import OutcomeCache, outcome_cache
-from epypes.batch.contact_sheet import Sheet, sheet_of
-from epypes.batch.executors import run_jobs, runs_here, worker_count
+from epypes.batch.contact_sheet import Sheet, sheet_of, sheet_page
+from epypes.batch.executors import progress_bar, run_jobs, runs_here, worker_count
 from epypes.batch.grid import Setting, functions_after, require_room, running_order, settings_of, steps
-from epypes.batch.items import (
-    FileSet,
-    Item,
-    SeriesKeys,
-    count_of,
-    detached_runner,
-    holds_its_arrays,
-    image_set,
-    items_of,
-    with_series,
-)
-from epypes.batch.job import NO_SETTING, Job, SharedStart, State
-from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, OutcomeSequence, fixed_columns, outcomes_frame, outcomes_html
-from epypes.batch.series import Done, SeriesRuns, in_parts, whole_series
+from epypes.batch.items import ImageSet, Item, SeriesKeys, detached_runner, image_set, items_of, with_series
+from epypes.batch.job import NO_SETTING, Done, Job, SeriesRuns, SharedStart, State, whole_series
+from epypes.batch.results import BatchResult, Outcome, outcomes_frame, outcomes_html
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
@@ -49,7 +36,7 @@ _UNITS: Final = {"map": "image", "sweep": "setting"}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class MapResult(OutcomeSequence):
+class MapResult(BatchResult[Outcome]):
     """The results of a map: a sequence of outcomes in the order of the images, shown as a table.
 
     Attributes
@@ -71,19 +58,16 @@ class MapResult(OutcomeSequence):
         """
         return outcomes_frame(self.outcomes, self.cg)
 
-    def __repr__(self) -> str:
-        return f"<MapResult: {self._caption}>"
-
     @property
     def _caption(self) -> str:
         return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": outcomes_html(self.outcomes, self.cg, self._caption)}
+    def _page(self) -> str:
+        return outcomes_html(self.outcomes, self.cg, self._caption)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class SweepResult(OutcomeSequence):
+class SweepResult(BatchResult[Outcome]):
     """The results of a sweep; shows itself as a contact sheet.
 
     Attributes
@@ -106,11 +90,7 @@ class SweepResult(OutcomeSequence):
         Its columns are name, the hyperparameters that were varied, failure (None, or what failed), the sink tokens,
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
-        taken = fixed_columns(self.outcomes)
-        varied = {
-            f"{name} (hyperparameter)" if name in taken else name: [one.setting.get(name) for one in self.outcomes]
-            for name in self.names
-        }
+        varied = {name: [outcome.setting.get(name) for outcome in self.outcomes] for name in self.names}
         return outcomes_frame(self.outcomes, self.runner.cg, varied)
 
     def sheet(self, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Sheet:
@@ -134,15 +114,13 @@ class SweepResult(OutcomeSequence):
         """
         return sheet_of(self.runner.cg, self.outcomes, token, rows, columns)
 
-    def __repr__(self) -> str:
-        failed = f"{len(self.failures)} failed"
-        varied = ", ".join(self.names)
-        return f"<SweepResult: {counted(len(self), 'outcome')} of {varied:.40}; {failed}>"
+    @property
+    def _caption(self) -> str:
+        failed, varied = len(self.failures), ", ".join(self.names)
+        return f"{counted(len(self), 'outcome')} of {varied:.40}; {failed} failed"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        shown = self.sheet()
-        bundle = shown._repr_mimebundle_()
-        return {**bundle, "text/plain": bundle["text/plain"].replace(repr(shown), repr(self))}
+    def _page(self) -> str:
+        return sheet_page(self.sheet())
 
 
 def map_images(
@@ -231,11 +209,12 @@ def map_images(
     >>> [outcome.values["brightness"] for outcome in result]
     [3.0, 7.0]
     """
-    outcomes = run_items(
-        runner, images, (NO_SETTING,), executor,
-        kind="map", keep=keep, show=show, series=series, store=store, name=name, progress=progress, ahead=ahead,
+    batch = _Batch(
+        runner=detached_runner(runner), images=image_set(images), settings=(NO_SETTING,), executor=executor, kind="map",
+        keep=tokens_of(runner, keep), show=None if show is None else tokens_of(runner, show), series=series,
+        store=store, name=name, progress=progress, ahead=ahead,
     )  # fmt: skip
-    return MapResult(runner.cg, outcomes)
+    return MapResult(runner.cg, batch.run())
 
 
 def sweep(
@@ -316,27 +295,12 @@ def sweep(
         images = [Item(0, "last payload", _last_payload(runner))]
         state = None if runner.last is None else runner.last.state_before or None
     settings = settings_of(runner, grid, how=how, n=n, seed=seed)
-    outcomes = run_items(
-        runner, images, settings, executor,
-        kind="sweep", keep=keep, show=show, series=series, state=state, store=store, name=name, progress=progress,
+    batch = _Batch(
+        runner=detached_runner(runner), images=image_set(images), settings=settings, executor=executor, kind="sweep",
+        keep=tokens_of(runner, keep), show=None if show is None else tokens_of(runner, show), series=series,
+        store=store, name=name, progress=progress, state=state,
     )  # fmt: skip
-    return SweepResult(outcomes, tuple(settings[0]), runner)
-
-
-def _require_room(
-    runner: CompGraphRunner, settings: Sequence[Setting], shown: Sequence[str] | None, images: int
-) -> None:
-    """Raise ScaleError if the outcomes of a sweep, or the pictures of tokens that vary, are too many to hold."""
-    require_room(len(settings), settings[0], images)
-    varying = {token for name in functions_after(runner.cg, *settings[0]) for token in runner.cg.func_outputs(name)}
-    tokens = varying if shown is None else varying.intersection(shown)
-    pictures = len(settings) * images * len(tokens)
-    if pictures > _MOST_PICTURES:
-        raise ScaleError(
-            f"Thumbnails of {len(tokens)} tokens with {len(settings):,} settings on {images:,} images are up to "
-            f"{pictures:,} pictures, and at most {_MOST_PICTURES:,} can be held. Name fewer, as show=(), or take "
-            "fewer values."
-        )
+    return SweepResult(batch.run(), tuple(settings[0]), runner)
 
 
 def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
@@ -350,123 +314,140 @@ def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
 # -- items and settings as jobs -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Batch:
-    """What is run on which images; ``settings`` are in the order in which they are run."""
+    """What is run on which images: the attributes are the parameters of ``map`` and ``sweep``.
+
+    ``kind`` is ``"map"`` or ``"sweep"``. Each series begins with ``state``, without it with the initial state of the
+    graph. The runner is detached: if the caller changes hyperparameters meanwhile, that does not change what is
+    computed and stored.
+    """
 
     runner: CompGraphRunner
-    images: Any
-    series: SeriesKeys | None
+    images: ImageSet
     settings: tuple[Setting, ...]
     executor: Executor | None
-    kept: tuple[str, ...]
-    shown: tuple[str, ...] | None
-    is_sweep: bool
+    kind: str
+    keep: tuple[str, ...]
+    show: tuple[str, ...] | None
+    series: SeriesKeys | None
+    store: str | Path | Store | None
+    name: str | None
+    progress: bool | None
+    state: State | None = None
+    ahead: int | None = None
 
-    def items(self) -> Iterator[Item]:
-        for item in with_series(items_of(self.images, self.runner), self.series):
-            # How many a generator gives is known when it gives them; a map may be of any number.
-            if self.is_sweep:
-                _require_room(self.runner, self.settings, self.shown, item.number + 1)
+    def run(self) -> tuple[Outcome, ...]:
+        """Return the outcomes of items under settings: item by item, in each in the order of its settings."""
+        runner, images = self.runner, self.images
+        state = runner.state or None if self.state is None else self.state
+        # By object: a setting comes back as the very mapping that was sent.
+        places = {id(setting): place for place, setting in enumerate(self.settings)}
+        self.settings = tuple(self.settings[place] for place in running_order(runner.cg, self.settings))
+        if self.kind == "sweep":
+            self._require_room(images.count or 1)
+        # Where what is stored decides which series are run, the items are gone through twice.
+        is_read = state is None or not (isinstance(images.values, Iterator) or isinstance(self.series, Iterator))
+        outcomes: list[Outcome] = []
+        total = None if images.count is None else images.count * len(self.settings)
+        with (
+            outcome_cache(
+                self.store, self.kind, runner, self.name,
+                keep=self.keep, show=self.show, settings=self.settings, state=state, is_read=is_read,
+            ) as cache,
+            progress_bar(self.progress, total, self.kind, unit=_UNITS[self.kind]) as advance,
+        ):  # fmt: skip
+
+            def take(found: Sequence[Outcome]) -> None:
+                outcomes.extend(found)
+                advance(len(found), sum(outcome.has_failed for outcome in found))
+
+            runs = None if state is None else self._series_runs(state, cache, take)
+            jobs = self._jobs(cache, take) if runs is None else runs
+            for found in run_jobs(runner, jobs, self.executor, ahead=self.ahead):
+                settled = found if runs is None else runs.settle(found)
+                if cache is not None:
+                    cache.add(settled)
+                take(settled)
+        return tuple(sorted(outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
+
+    def _require_room(self, images: int) -> None:
+        """Raise ScaleError if the outcomes of a sweep, or the pictures of tokens that vary, are too many to hold."""
+        settings, cg = self.settings, self.runner.cg
+        require_room(len(settings), settings[0], images)
+        varying = {token for name in functions_after(cg, *settings[0]) for token in cg.func_outputs(name)}
+        tokens = varying if self.show is None else varying.intersection(self.show)
+        pictures = len(settings) * images * len(tokens)
+        if pictures > _MOST_PICTURES:
+            raise ScaleError(
+                f"Thumbnails of {len(tokens)} tokens with {len(settings):,} settings on {images:,} images are up to "
+                f"{pictures:,} pictures, and at most {_MOST_PICTURES:,} can be held. Name fewer, as show=(), or take "
+                "fewer values."
+            )
+
+    def _items(self) -> Iterator[Item]:
+        items = with_series(items_of(self.images, self.runner), self.series)
+        # How many a generator gives is known when it gives them; a map may be of any number.
+        return self._limited(items) if self.kind == "sweep" and self.images.count is None else items
+
+    def _limited(self, items: Iterator[Item]) -> Iterator[Item]:
+        for item in items:
+            self._require_room(item.number + 1)
             yield item
             # This generator waits for its caller, and must not keep the item alive meanwhile.
             del item
 
-    def jobs(self, cache: OutcomeCache | None, take: Callable[[list[Outcome]], None]) -> Iterator[Job]:
+    def _jobs(self, cache: OutcomeCache | None, take: Callable[[Sequence[Outcome]], None]) -> Iterator[Job]:
         """Yield the jobs of each item: what is not stored, in parts, which in this process share the first run."""
-        count = count_of(self.images)
-        for item in self.items():
+        for item in self._items():
             missing = self.settings
             if cache is not None:
                 stored = cache.found(item)
                 take([outcome for outcome in stored if outcome is not None])
                 missing = tuple(one for one, outcome in zip(missing, stored, strict=True) if outcome is None)
-            parts = _parts(self.runner, missing, self.executor, count)
+            parts = self._parts(missing)
             start = SharedStart() if len(parts) > 1 and runs_here(self.executor) else None
             for part in parts:
-                yield Job(item, part, self.kept, self.shown, start)
+                yield Job(item, part, self.keep, self.show, start)
             del item, start
 
-    def series_runs(
-        self, state: State, cache: OutcomeCache | None, take: Callable[[list[Outcome]], None]
+    def _parts(self, settings: tuple[Setting, ...]) -> list[tuple[Setting, ...]]:
+        """Cut the settings of an item into parts that several workers run at the same time."""
+        if self.executor is None or len(settings) < 2:
+            return [settings] if settings else []
+        workers = worker_count(self.executor)
+        # Outside of this process each part computes what all have in common: there are only as many as keep all
+        # workers at work.
+        count = -(-workers // max(self.images.count or workers, 1))
+        count *= _PARTS if count > 1 and runs_here(self.executor) else 1
+        # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
+        places = steps(self.runner.cg, settings)
+        places = places if len(places) >= workers else list(range(len(settings)))
+        return _cut(settings, max(count, -(-len(settings) // _MOST_SETTINGS)), places)
+
+    def _series_runs(
+        self, state: State, cache: OutcomeCache | None, take: Callable[[Sequence[Outcome]], None]
     ) -> SeriesRuns:
         """Return the runs of series; those of which all is stored are taken from there."""
-        items, done = self.items(), set[Done]()
+        items, done = self._items(), frozenset[Done]()
         if cache is not None and cache.has_outcomes:
-            stored, done = whole_series(self.items(), self.settings, cache.found)
+            stored, done = whole_series(self._items(), self.settings, cache.found)
             take(stored)
         elif cache is not None:
             items = cache.noting(items)
-        if self.executor is None:
-            return SeriesRuns(items, [self.settings], state, 1, done)
-        room: float = _JOBS_PER_WORKER * worker_count(self.executor)
-        parts = in_parts(self.settings, int(room))
+        room = 1 if self.executor is None else _JOBS_PER_WORKER * worker_count(self.executor)
+        template = Job(Item(0, "", {}), keep=self.keep, show=self.show)
+        parts = [replace(template, settings=part) for part in _cut(self.settings, room, range(len(self.settings)))]
         # Of what is in memory anyway, or in files, so many are taken that all series begin.
-        is_held = isinstance(self.images, FileSet | Video) or holds_its_arrays(self.images)
-        room = math.inf if is_held else room
-        return SeriesRuns(items, parts, state, room, done)
-
-    def series_jobs(self, runs: SeriesRuns) -> Iterator[Job | None]:
-        for one in runs:
-            yield None if one is None else Job(one[0], one[1], self.kept, self.shown, states=one[2])
-            del one
+        is_taken = self.images.is_held and self.executor is not None
+        return SeriesRuns(items, parts, state, math.inf if is_taken else room, done)
 
 
-def run_items(
-    runner: CompGraphRunner,
-    images: Any,
-    settings: tuple[Setting, ...],
-    executor: Executor | None,
-    *,
-    kind: str,
-    keep: Sequence[str],
-    show: Sequence[str] | None,
-    series: SeriesKeys | None,
-    store: str | Path | Store | None,
-    name: str | None,
-    progress: bool | None,
-    state: State | None = None,
-    ahead: int | None = None,
-) -> tuple[Outcome, ...]:
-    """Return the outcomes of items under settings: item by item, in each in the order of its settings.
-
-    The parameters are those of ``map`` and ``sweep``; ``kind`` is ``"map"`` or ``"sweep"``. Each series begins with
-    ``state``, without it with the initial state of the graph.
-    """
-    # If the caller changes hyperparameters meanwhile, that does not change what is computed and stored.
-    runner = detached_runner(runner)
-    state = runner.state or None if state is None else state
-    kept, shown = tokens_of(runner, keep), None if show is None else tokens_of(runner, show)
-    in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
-    # By object: a setting comes back as the very mapping that was sent.
-    places = {id(setting): place for place, setting in enumerate(settings)}
-    images = image_set(images)
-    count, is_sweep = count_of(images), kind == "sweep"
-    if is_sweep:
-        _require_room(runner, settings, shown, count or 1)
-    batch = _Batch(runner, images, series, in_order, executor, kept, shown, is_sweep)
-    # Where what is stored decides which series are run, the items are gone through twice.
-    is_read = state is None or not (isinstance(images, Iterator) or isinstance(series, Iterator))
-    outcomes: list[Outcome] = []
-    with (
-        outcome_cache(
-            store, kind, runner, name, keep=kept, show=shown, settings=in_order, state=state, is_read=is_read
-        ) as cache,
-        progress_bar(progress, count and count * len(settings), kind, unit=_UNITS[kind]) as advance,
-    ):
-
-        def take(found: list[Outcome]) -> None:
-            outcomes.extend(found)
-            advance(len(found), sum(outcome.has_failed for outcome in found))
-
-        runs = None if state is None else batch.series_runs(state, cache, take)
-        source = batch.jobs(cache, take) if runs is None else batch.series_jobs(runs)
-        for found in run_jobs(runner, source, executor, ahead=ahead):
-            settled = found if runs is None else runs.settle(found)
-            if cache is not None:
-                cache.add(settled)
-            take(settled)
-    return tuple(sorted(outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)])))
+def _cut(settings: tuple[Setting, ...], most: int, places: Sequence[int]) -> list[tuple[Setting, ...]]:
+    """Cut settings into at most so many parts of about the same size, each of which begins at one of some places."""
+    count = min(most, len(places))
+    cuts = [*(places[len(places) * part // count] for part in range(count)), len(settings)]
+    return [settings[first:end] for first, end in pairwise(cuts)]
 
 
 def tokens_of(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:
@@ -475,22 +456,3 @@ def tokens_of(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str,
     for token in tokens:
         runner.cg.require_token(token)
     return tokens
-
-
-def _parts(
-    runner: CompGraphRunner, settings: tuple[Setting, ...], executor: Executor | None, count: int | None
-) -> list[tuple[Setting, ...]]:
-    """Cut the settings of an item into parts that several workers run at the same time."""
-    if executor is None or len(settings) < 2:
-        return [settings] if settings else []
-    workers = worker_count(executor)
-    # Outside of this process each part computes what all have in common: there are only as many as keep all
-    # workers at work.
-    parts = -(-workers // max(count or workers, 1))
-    parts *= _PARTS if parts > 1 and runs_here(executor) else 1
-    # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
-    places = steps(runner.cg, settings)
-    places = places if len(places) >= workers else list(range(len(settings)))
-    parts = min(max(parts, -(-len(settings) // _MOST_SETTINGS)), len(places))
-    cuts = [*(places[len(places) * part // parts] for part in range(parts)), len(settings)]
-    return [settings[first:end] for first, end in pairwise(cuts)]

@@ -14,23 +14,22 @@ import threading
 import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from epypes.acquisition.files import is_video_name
 from epypes.batch.cache import SearchKey
-from epypes.batch.cases import Case, cases_of, with_labels_read
-from epypes.batch.executors import run_jobs, runs_here, worker_count
+from epypes.batch.cases import Case, case_items, cases_of, with_labels_read
+from epypes.batch.executors import progress_bar, run_jobs, runs_here, worker_count
 from epypes.batch.grid import Axis, ChoiceAxis, axes_of, bounded
-from epypes.batch.items import case_items, detached_runner, items_of
+from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import tokens_of
-from epypes.batch.progress import progress_bar
-from epypes.batch.results import Outcome, frame_of, html_table, object_column, value_text
-from epypes.batch.thumbnails import data_uri, thumbnail_of_value
-from epypes.display.text import content, cut, cut_name, escape
+from epypes.batch.results import BatchResult, Outcome, failure_column, frame_of, html_table, value_text
+from epypes.batch.thumbnails import picture_element, thumbnail_of_value
+from epypes.display.text import content, cut, cut_name
 from epypes.errors import ScaleError
 from epypes.graph import subgraph
 from epypes.nothing import Nothing
@@ -57,6 +56,10 @@ _REASON_CHARACTERS: Final = 300
 _FAILURE: Final = "failure"
 _NANOSECONDS: Final = "total_ns"
 _ABOUT: Final = "about"
+# On the page.
+_MOST_REASONS: Final = 3
+_TEXT_ROOM: Final = 200
+_CURVE_PX: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +86,14 @@ class Trial:
     failure: str = ""
     total_ns: int = 0
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether there is no value."""
+        return self.value is None
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OptimizeResult:
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class OptimizeResult(BatchResult[Trial]):
     """The trials of a search; made by ``ep.optimize``.
 
     Attributes
@@ -104,21 +112,12 @@ class OptimizeResult:
         Whether the search was stopped before all trials were run.
     """
 
-    trials: tuple[Trial, ...] = field(repr=False)
+    trials: tuple[Trial, ...]
     direction: Direction
     metric: str
-    axes: tuple[Axis, ...] = field(repr=False)
-    study: optuna.Study = field(repr=False)
+    axes: tuple[Axis, ...]
+    study: optuna.Study
     was_stopped: bool = False
-
-    def __len__(self) -> int:
-        return len(self.trials)
-
-    def __iter__(self) -> Iterator[Trial]:
-        return iter(self.trials)
-
-    def __getitem__(self, index: int) -> Trial:
-        return self.trials[index]
 
     @property
     def best_trial(self) -> Trial:
@@ -145,11 +144,6 @@ class OptimizeResult:
         return _value(self.best_trial)
 
     @property
-    def failures(self) -> tuple[Trial, ...]:
-        """The trials that failed."""
-        return tuple(trial for trial in self.trials if trial.value is None)
-
-    @property
     def importances(self) -> dict[str, float]:
         """How much each hyperparameter matters for good values, as parts of 1, the most important first.
 
@@ -161,7 +155,7 @@ class OptimizeResult:
         completed = self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
         if len({trial.value for trial in completed}) < 2:
             return {}
-        with quiet_optuna():
+        with _quiet_optuna():
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             return dict(optuna.importance.get_param_importances(self.study, evaluator=evaluator))
 
@@ -179,34 +173,46 @@ class OptimizeResult:
             ``failure`` (None, or the reason), and ``ms``: of the functions, over all cases. A hyperparameter that is
             called like one of these has `` (hyperparameter)`` after its name.
         """
-        taken = {"trial", self.metric, "state", "failure", "ms"}
-        columns: dict[str, Any] = {"trial": [trial.number for trial in self.trials]}
-        for axis in self.axes:
-            title = f"{axis.token} (hyperparameter)" if axis.token in taken else axis.token
-            columns[title] = [trial.setting[axis.token] for trial in self.trials]
-        columns[self.metric] = [float("nan") if trial.value is None else trial.value for trial in self.trials]
-        columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
-        columns["failure"] = object_column([trial.failure or None for trial in self.trials])
-        columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
-        return frame_of(columns)
+        trials = self.trials
+        return frame_of([
+            ("trial", [trial.number for trial in trials], ""),
+            *((axis.token, [trial.setting[axis.token] for trial in trials], "hyperparameter") for axis in self.axes),
+            (self.metric, [math.nan if trial.value is None else trial.value for trial in trials], ""),
+            ("state", ["failed" if trial.has_failed else "complete" for trial in trials], ""),
+            failure_column(trial.failure for trial in trials),
+            ("ms", [trial.total_ns / 1e6 for trial in trials], ""),
+        ])  # fmt: skip
 
     def history_plot(self) -> Figure:
         """Draw the value of each trial that completed, and the best one so far, as Optuna does with Matplotlib."""
         from optuna.visualization.matplotlib import plot_optimization_history
 
-        _ = self.best_trial  # without one there is nothing to draw
-        return _figure(lambda: plot_optimization_history(self.study, target_name=self.metric))
+        return self._figure(lambda: plot_optimization_history(self.study, target_name=self.metric))
 
     def importance_plot(self) -> Figure:
         """Draw how much each hyperparameter matters, as Optuna does with Matplotlib."""
         from optuna.importance import PedAnovaImportanceEvaluator
         from optuna.visualization.matplotlib import plot_param_importances
 
-        _ = self.best_trial
-        with quiet_optuna():
-            # The default one of older versions needs scikit-learn.
-            evaluator = PedAnovaImportanceEvaluator()
-            return _figure(lambda: plot_param_importances(self.study, evaluator, target_name=self.metric))
+        # The default evaluator of older versions needs scikit-learn.
+        return self._figure(
+            lambda: plot_param_importances(self.study, PedAnovaImportanceEvaluator(), target_name=self.metric)
+        )
+
+    def _figure(self, draw: Callable[[], Axes]) -> Figure:
+        """Return a figure that Optuna draws; it leaves no style set, and no figure open in pyplot."""
+        from matplotlib import pyplot
+
+        _ = self.best_trial  # without one there is nothing to draw
+        with pyplot.rc_context(), _quiet_optuna():
+            draw()
+            figure = pyplot.gcf()
+        pyplot.close(figure)
+        return figure
+
+    @property
+    def _rows(self) -> tuple[Trial, ...]:
+        return self.trials
 
     @property
     def _caption(self) -> str:
@@ -215,11 +221,40 @@ class OptimizeResult:
         state = f"{f', {failed} failed' if failed else ''}{', stopped' * self.was_stopped}"
         return f"{counted(len(self.trials), 'trial')}{state}; {found}"
 
-    def __repr__(self) -> str:
-        return f"<OptimizeResult: {self._caption}>"
+    def _page(self) -> str:
+        """Return the curve of the best value so far, the table of what was found, and why trials failed."""
+        best = best_of(self.trials, self.direction)
+        parts = [f"<p>{content(self._caption)}</p>"]
+        if best is not None:
+            parts += [self._curve(), self._table(best)]
+        reasons = list(dict.fromkeys(trial.failure for trial in self.failures))
+        if reasons:
+            items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
+            more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
+            parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
+        return f"<div>{''.join(parts)}</div>"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": _page(self)}
+    def _curve(self) -> str:
+        """Return a picture of the best value so far, by trial that completed."""
+        import numpy as np
+
+        values = [trial.value for trial in self.trials if trial.value is not None]
+        so_far = np.maximum.accumulate(values) if self.direction == "maximize" else np.minimum.accumulate(values)
+        picture, metric = thumbnail_of_value(so_far), cut_name(self.metric, 30)
+        text = f"The best {metric} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}."
+        return "" if picture is None else picture_element(picture, text, _TEXT_ROOM, _CURVE_PX)
+
+    def _table(self, best: Trial) -> str:
+        first, parts = self.trials[0], self.importances
+        tokens = sorted((axis.token for axis in self.axes), key=lambda token: -parts.get(token, 0.0))
+        first_value = "failed" if first.value is None else f"{first.value:.6g}"
+        columns = [
+            ("hyperparameter", [self.metric, *tokens]),
+            (f"best (trial {best.number})", [f"{best.value:.6g}", *(value_text(best.setting[t]) for t in tokens)]),
+            ("first trial", [first_value, *(value_text(first.setting[token]) for token in tokens)]),
+            ("importance", ["", *(f"{parts[token]:.0%}" if token in parts else "" for token in tokens)]),
+        ]
+        return html_table("", columns)
 
 
 def best_of(trials: Sequence[Trial], direction: Direction) -> Trial | None:
@@ -331,12 +366,25 @@ def optimize(
     axes = axes_of(runner, ranges)
     objective = _Objective(runner, metric, _cases(cases, runner), keep)
     at_once = 1 if executor is None else worker_count(executor)
-    with opened_store(store) as opened:
+    stop, was_interrupted = stop or threading.Event(), False
+    with opened_store(store) as opened, contextlib.ExitStack() as stack:
         key = None if opened is None else _key(objective, axes, direction, name)
-        with contextlib.closing(_Search(axes, runner.hyperparameters, direction, seed, at_once, opened, key)) as search:
-            was_stopped = _searched(search, objective, executor, stop or threading.Event(), n, on_trial, progress)
-            search.forget_changed()
-    result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
+        search = _Search(axes, runner.hyperparameters, direction, seed, at_once, opened, key)
+        stack.callback(search.close)
+        advance = stack.enter_context(progress_bar(progress, n, f"optimize {objective.name}", unit="trial"))
+        done = search.trials
+        advance(len(done), sum(trial.has_failed for trial in done))
+        coming = stack.enter_context(contextlib.closing(_trials(search, objective, executor, stop, n - len(done))))
+        try:
+            for trial in coming:
+                advance(1, int(trial.has_failed))
+                if on_trial is not None:
+                    on_trial(trial)
+        except KeyboardInterrupt:
+            was_interrupted = True
+        search.forget_changed()
+        was_stopped = was_interrupted or stop.is_set()
+        result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
     if result.trials and not was_stopped and len(result.failures) == len(result):
         first = result.trials[0]
         text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
@@ -364,30 +412,6 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
             return (Case(given, name=str(given)),)
         return tuple(Case(item.payload, name=item.name) for item in items_of(given, runner))
     return tuple(with_labels_read(case, runner.cg) for case in cases_of(given, are_series=bool(runner.state)))
-
-
-def _searched(
-    search: _Search,
-    objective: _Objective,
-    executor: Executor | None,
-    stop: threading.Event,
-    n: int,
-    on_trial: Callable[[Trial], object] | None,
-    progress: bool | None,
-) -> bool:
-    """Run the trials that are still to be run; return whether the search was stopped before its end."""
-    done = search.trials
-    with progress_bar(progress, n, f"optimize {objective.name}", unit="trial") as advance:
-        advance(len(done), sum(trial.value is None for trial in done))
-        try:
-            with contextlib.closing(_trials(search, objective, executor, stop, n - len(done))) as coming:
-                for trial in coming:
-                    advance(1, trial.value is None)
-                    if on_trial is not None:
-                        on_trial(trial)
-        except KeyboardInterrupt:
-            return True
-    return stop.is_set()
 
 
 def _trials(
@@ -463,8 +487,7 @@ class _Objective:
             kind = type(metric).__name__
             raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
         self.runner, self.cases = runner, tuple(cases)
-        items = case_items([case.inputs for case in cases], runner)
-        self.items = [replace(item, name=case.name or item.name) for case, item in zip(cases, items, strict=True)]
+        self.items = list(case_items(self.cases, runner))
         self.metric = metric
         self.name = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         kept = runner.cg.sink_tokens if keep is None else keep
@@ -482,29 +505,35 @@ class _Objective:
         spent_ns = sum(outcome.total_ns for outcome in outcomes.values())
         for index, outcome in sorted(outcomes.items()):
             case = self.cases[index]
-            value, failure = self._measured(case, outcome)
-            if failure:
+            try:
+                values.append(self._measure(case, outcome))
+            except _NotMeasured as error:
                 where = f"{case.name}: " if len(self.cases) > 1 and case.name else ""
-                return None, f"{where}{failure}"[:_REASON_CHARACTERS], spent_ns
-            values.append(value)
+                return None, f"{where}{error}"[:_REASON_CHARACTERS], spent_ns
         return math.fsum(values) / len(values), "", spent_ns
 
-    def _measured(self, case: Case, outcome: Outcome) -> tuple[float, str]:
-        """Return the metric of one case, and the reason if there is none."""
+    def _measure(self, case: Case, outcome: Outcome) -> float:
+        """Return the metric of one case; _NotMeasured says why there is none."""
         if outcome.error_info is not None:
-            return math.nan, str(outcome.error_info)
+            raise _NotMeasured(outcome.error_info)
         tokens, metric = MappingProxyType(dict(outcome.kept)), self.metric
         try:
             given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
         except (Exception, SystemExit) as error:
-            return math.nan, f"{self.name} raised {type(error).__name__}: {error}"
+            raise _NotMeasured(f"{self.name} raised {type(error).__name__}: {error}") from error
         if given is Nothing:
-            return math.nan, f"{self.name} gave Nothing: nothing was found"
+            raise _NotMeasured(f"{self.name} gave Nothing: nothing was found")
         try:
             value = float(given)
-        except (TypeError, ValueError, OverflowError):
-            return math.nan, f"{self.name} gave a {type(given).__name__!r}, no number"
-        return value, "" if math.isfinite(value) else f"{self.name} gave {value}"
+        except (TypeError, ValueError, OverflowError) as error:
+            raise _NotMeasured(f"{self.name} gave a {type(given).__name__!r}, no number") from error
+        if not math.isfinite(value):
+            raise _NotMeasured(f"{self.name} gave {value}")
+        return value
+
+
+class _NotMeasured(Exception):
+    """A case has no value; the text says why."""
 
 
 class _Search:
@@ -543,12 +572,11 @@ class _Search:
     ) -> None:
         with optional_import():
             import optuna
-        self._axes, self._direction = axes, direction
-        self._present, self._key = present, key
+        self._axes, self._direction, self._present, self._key = axes, direction, present, key
         self._distributions = {axis.token: axis.distribution for axis in axes}
         self._storage: optuna.storages.RDBStorage | None = None
         self._stored: optuna.Study | None = None
-        with quiet_optuna():
+        with _quiet_optuna():
             before = [] if store is None or key is None else self._open(store, key)
             # A search that goes on has another seed: the same numbers again would be the same trials again.
             sampler = optuna.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
@@ -642,67 +670,8 @@ def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
     return [trial for trial in study.get_trials(deepcopy=False) if trial.state.is_finished()]
 
 
-# -- figures and page -------------------------------------------------------------------------------------------
-
-
-def _figure(draw: Callable[[], Axes]) -> Figure:
-    """Return a figure that Optuna draws; it leaves no style set, and no figure open in pyplot."""
-    from matplotlib import pyplot
-
-    with pyplot.rc_context(), quiet_optuna():
-        draw()
-        figure = pyplot.gcf()
-    pyplot.close(figure)
-    return figure
-
-
-_MOST_REASONS: Final = 3
-
-
-def _page(result: OptimizeResult) -> str:
-    best = best_of(result.trials, result.direction)
-    parts = [f"<p>{content(result._caption)}</p>"]
-    if best is not None:
-        parts += [_curve(result), _table(result, best)]
-    reasons = list(dict.fromkeys(trial.failure for trial in result.failures))
-    if reasons:
-        items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
-        more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
-        parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
-    return f"<div>{''.join(parts)}</div>"
-
-
-def _curve(result: OptimizeResult) -> str:
-    """Return a picture of the best value so far, by trial that completed."""
-    import numpy as np
-
-    values = [trial.value for trial in result.trials if trial.value is not None]
-    so_far = np.maximum.accumulate(values) if result.direction == "maximize" else np.minimum.accumulate(values)
-    picture = thumbnail_of_value(so_far)
-    if picture is None:
-        return ""
-    alt = escape(f"The best {cut_name(result.metric, 30)} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}.")
-    return f'<img src="{data_uri(picture)}" width="256" alt="{alt}" title="{alt}">'
-
-
-def _table(result: OptimizeResult, best: Trial) -> str:
-    first, parts = result.trials[0], result.importances
-    rows = [
-        (
-            axis.token,
-            value_text(best.setting[axis.token]),
-            value_text(first.setting[axis.token]),
-            f"{parts[axis.token]:.0%}" if axis.token in parts else "",
-        )
-        for axis in sorted(result.axes, key=lambda axis: -parts.get(axis.token, 0.0))
-    ]
-    values = (result.metric, f"{best.value:.6g}", "failed" if first.value is None else f"{first.value:.6g}", "")
-    head = ("hyperparameter", f"best (trial {best.number})", "first trial", "importance")
-    return html_table("", head, [values, *rows])
-
-
 @contextlib.contextmanager
-def quiet_optuna() -> Iterator[None]:
+def _quiet_optuna() -> Iterator[None]:
     """Keep Optuna from printing, and from warning that a feature used here was once experimental."""
     import optuna
 

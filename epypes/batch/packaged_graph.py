@@ -7,16 +7,14 @@ not, such as OpenCV's keypoints. Nothing of the notebook is ever pickled.
 
 from __future__ import annotations
 
-import functools
 import os
-import re
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from epypes.batch.cache import graph_fingerprint
 from epypes.batch.items import Item, frames_of, payload_of
@@ -34,10 +32,11 @@ from epypes.run.runner import branched
 from epypes.wire import Envelope, decode, encode
 from epypes.wording import ended
 
+_K = TypeVar("_K")
+_V = TypeVar("_V")
 _NAME: Final = "graph"
 # Stands in the reasons in place of the temporary folder.
 _BUNDLE: Final = "the graph's bundle"
-_MISSING: Final = re.compile(r"ModuleNotFoundError: No module named '([^']+)'")
 _MOST_PACKAGES: Final = 16
 _NOTE: Final = (
     "To be run by other processes or a cluster, a graph is promoted to a bundle first. "
@@ -84,11 +83,13 @@ def package_of(runner: CompGraphRunner, item: Item) -> PackagedGraph | None:
         own.run_on(payload_of(next(frames_of(item, own)), own.cg))
     except (Exception, SystemExit):  # whatever a function raises: it will be that item's failure
         return None
-    with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
+    with tempfile.TemporaryDirectory(prefix="epypes-package-") as place:
+        folder = Path(place).resolve() / _NAME
         try:
-            bundle = promote(own, Path(folder) / _NAME)
+            bundle = promote(own, folder)
         except PromotionRefused as error:
-            refused = PromotionRefused(_BUNDLE, _reasons(error.reasons, Path(folder) / _NAME))
+            # The user has not named the temporary folder.
+            refused = PromotionRefused(_BUNDLE, [reason.replace(str(folder), _BUNDLE) for reason in error.reasons])
             refused.add_note(_NOTE)
             raise refused from error
         except BundleError as error:
@@ -98,27 +99,15 @@ def package_of(runner: CompGraphRunner, item: Item) -> PackagedGraph | None:
         files = {name: (bundle.path / name).read_bytes() for name in names}
     package = PackagedGraph(bundle.digest, files)
     if key is not None:
-        _PACKAGES[key] = package
-        _drop_oldest(_PACKAGES, _MOST_PACKAGES)
+        _keep(_PACKAGES, key, package, _MOST_PACKAGES)
     return package
 
 
-def _reasons(reasons: Sequence[str], folder: Path) -> list[str]:
-    """Return the reasons without the temporary folder, which the user has not named; missing modules come first."""
-    places = sorted({str(folder), str(folder.resolve())}, key=len, reverse=True)
-    texts = [functools.reduce(lambda text, place: text.replace(place, _BUNDLE), places, reason) for reason in reasons]
-    missing = dict.fromkeys(name for reason in texts for name in _MISSING.findall(reason))
-    first = [
-        f"Module {name!r} is not installed, so no other process can import it: install it as a package, or take a "
-        "ThreadPoolExecutor, or no executor, which run the graph as it is."
-        for name in missing
-    ]
-    return [*first, *texts]
-
-
-def _drop_oldest(kept: dict[Any, Any], most: int) -> None:
-    for key in list(kept)[:-most]:
-        kept.pop(key, None)
+def _keep(kept: dict[_K, _V], key: _K, value: _V, most: int) -> None:
+    """Keep a value; the oldest ones go."""
+    kept[key] = value
+    for old in list(kept)[:-most]:
+        kept.pop(old, None)
 
 
 def _key_of(runner: CompGraphRunner) -> tuple[str, ...] | None:
@@ -202,20 +191,17 @@ def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:
 
 
 def _with_values(job: Job, convert: Callable[[Mapping[str, Any], str], dict[str, Any]]) -> Job:
+    def converted(item: Item) -> Item:
+        frames = tuple(map(converted, item.frames)) if isinstance(item.frames, tuple) else item.frames
+        # The key of a series may be anything, and only this process needs it.
+        return replace(item, payload=convert(item.payload, "Input"), series=None, frames=frames)
+
     return replace(
         job,
-        item=_item_with_values(job.item, convert),
+        item=converted(job.item),
         settings=tuple(convert(setting, "Hyperparameter") for setting in job.settings),
         states=tuple(convert(state, "The state of") for state in job.states),
     )
-
-
-def _item_with_values(item: Item, convert: Callable[[Mapping[str, Any], str], dict[str, Any]]) -> Item:
-    frames = item.frames
-    if isinstance(frames, tuple):
-        frames = tuple(_item_with_values(frame, convert) for frame in frames)
-    # The key of a series may be anything, and only this process needs it.
-    return replace(item, payload=convert(item.payload, "Input"), series=None, frames=frames)
 
 
 def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
@@ -288,10 +274,10 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
                 folder = tempfile.TemporaryDirectory(prefix="epypes-package-")
                 bundle = _unpacked(packaged.package.files, Path(folder.name))
                 values = unpacked_values(packaged.hyperparameters, bundle.enums)
-                _LOADED[key] = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options)), folder
+                loaded = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options)), folder
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
                 return _load_error(packaged.package.files, error)
-            _drop_oldest(_LOADED, _MOST_LOADED)
+            _keep(_LOADED, key, loaded, _MOST_LOADED)
         enums, runner, _ = _LOADED[key]
     own = branched(runner)
     own.set(**unpacked_values(packaged.hyperparameters, enums))

@@ -1,21 +1,22 @@
-"""Outcomes of items, as JSON, as a pandas table and as an HTML table."""
+"""Outcomes of items, as JSON, as a pandas table and as an HTML table; results of any kind that show themselves."""
 
 from __future__ import annotations
 
+import abc
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, overload
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, overload
 
 from epypes.batch.items import Item
-from epypes.batch.thumbnails import Thumbnail, data_uri
+from epypes.batch.thumbnails import Thumbnail, picture_element
 from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
-from epypes.display.previews.short import float_text
-from epypes.display.text import content, duration_text, escape, fitted
+from epypes.display.previews.short import float_text, reason
+from epypes.display.text import content, duration_text, fitted
 from epypes.errors import ImageFileError, ScaleError
 from epypes.graph import CompGraph
 from epypes.nothing import Nothing
@@ -138,31 +139,13 @@ class Outcome:
         return replace(found, frame=item.frame, time_s=item.time_s, series=item.series)
 
 
-class OutcomeSequence(Sequence[Outcome]):
-    """The outcomes of a map or a sweep; ``outcomes`` has them as a tuple."""
-
-    __slots__ = ()
-    outcomes: tuple[Outcome, ...]
-
-    @property
-    def failures(self) -> tuple[Outcome, ...]:
-        """The outcomes of what could not be read or on which a function failed."""
-        return tuple(outcome for outcome in self.outcomes if outcome.has_failed)
-
-    @overload
-    def __getitem__(self, index: int) -> Outcome: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Outcome, ...]: ...
-    def __getitem__(self, index: int | slice) -> Outcome | tuple[Outcome, ...]:
-        return self.outcomes[index]
-
-    def __len__(self) -> int:
-        return len(self.outcomes)
-
-
 def short_value(value: Any) -> Any:
-    """Return a number, text or truth value as it is, and of anything else a short text."""
-    value = _scalar(value)
+    """Return a number, text or truth value as Python's own, and of anything else a short text."""
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        return f"int of {value.bit_length():,} bits"
+    if getattr(value, "shape", None) == () and hasattr(value, "item"):
+        item = value.item()
+        value = item if isinstance(item, bool | int | float) else value
     if value is None or type(value) in (bool, int, float, str):
         return value
     return str(value) if isinstance(value, str) else short_text(value)
@@ -173,36 +156,113 @@ def short_text(value: Any) -> str:
     return sketch(value, Look()).shown.text
 
 
-def _scalar(value: Any) -> Any:
-    """Return a number or truth value of numpy as Python's, and a very long number as text; anything else as it is."""
-    if isinstance(value, int) and value.bit_length() > _MOST_BITS:
-        return f"int of {value.bit_length():,} bits"
-    if getattr(value, "shape", None) != () or not hasattr(value, "item"):
-        return value
-    item = value.item()
-    return item if isinstance(item, bool | int | float) else value
+# -- results that show themselves ---------------------------------------------------------------------------------
 
 
-_FRAME_COLUMNS: Final = ("frame", "time_s")
+class ShownAsPage(abc.ABC):
+    """What a notebook shows as a page of HTML, and as text where that can't be made."""
+
+    __slots__ = ()
+
+    @abc.abstractmethod
+    def _page(self) -> str:
+        """Return the page."""
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        try:
+            return {"text/plain": repr(self), "text/html": self._page()}
+        except Exception as error:  # a notebook shows the result whatever is wrong with its pictures
+            return {"text/plain": f"{self!r}\n(no picture: {reason(error)})"}
 
 
-def fixed_columns(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
-    """Return the names of the columns that a table of outcomes has in any case."""
-    return ("name", *_item_columns(outcomes), "failure", "total_ms")
+class HasFailed(Protocol):
+    """A row of a result, such as an Outcome."""
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether something failed."""
+        ...
 
 
-def _item_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
-    """Return the columns that there are: of series if there are several or they have keys, of frames, and of times."""
-    columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in _FRAME_COLUMNS}
-    found = {name: values for name, values in columns.items() if any(value is not None for value in values)}
-    series = [outcome.series for outcome in outcomes]
-    # Of the frames of one video the names say it.
-    has_series = len(set(series)) > 1 or ("frame" not in found and any(key != "" for key in series))
-    return {"series": series, **found} if has_series else found
+_Row = TypeVar("_Row", bound=HasFailed)
+
+
+class BatchResult(ShownAsPage, Sequence[_Row]):
+    """The result of a map, a sweep, a check or a search: a sequence of rows that shows itself."""
+
+    __slots__ = ()
+    outcomes: tuple[_Row, ...]
+
+    @property
+    def _rows(self) -> tuple[_Row, ...]:
+        """What it is a sequence of."""
+        return self.outcomes
+
+    @property
+    @abc.abstractmethod
+    def _caption(self) -> str:
+        """What there is, in a line."""
+
+    @property
+    def failures(self) -> tuple[_Row, ...]:
+        """The rows of what failed or has not passed."""
+        return tuple(row for row in self._rows if row.has_failed)
+
+    @overload
+    def __getitem__(self, index: int) -> _Row: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[_Row, ...]: ...
+    def __getitem__(self, index: int | slice) -> _Row | tuple[_Row, ...]:
+        return self._rows[index]
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self._caption}>"
+
+
+# -- tables of pandas ---------------------------------------------------------------------------------------------
+
+
+def frame_of(columns: Iterable[tuple[str, Any, str]]) -> pd.DataFrame:
+    """Return a pandas table.
+
+    Parameters
+    ----------
+    columns
+        Name and values, and ``"token"`` or ``"hyperparameter"`` for what the user has named: if it is called like
+        another column, it has that after its name. Where a list has None and numbers, None becomes NaN or NA.
+    """
+    with optional_import():
+        import pandas as pd
+    columns = list(columns)
+    own = {name for name, _, kind in columns if not kind}
+    found: dict[str, Any] = {}
+    for name, values, kind in columns:
+        kinds = {type(value) for value in values if value is not None} if type(values) is list else set()
+        if kinds in ({bool}, {int}) and None in values:
+            # Integers and truth values stay what they are, but for those above 64 bits.
+            with suppress(OverflowError):
+                values = pd.array(values, dtype="boolean" if bool in kinds else "Int64")
+        found[f"{name} ({kind})" if kind and name in own else name] = values
+    return pd.DataFrame(found)
+
+
+def failure_column(reasons: Iterable[str]) -> tuple[str, Any, str]:
+    """Return the column of what failed, on one line each; None where nothing did."""
+    return "failure", object_column([" ".join(text.split()) or None for text in reasons]), ""
+
+
+def object_column(values: Sequence[Any]) -> Any:
+    """Return values as a column in which None stays None, since NaN is another value."""
+    with optional_import():
+        import pandas as pd
+    return pd.Series(list(values), dtype=object) if any(value is None for value in values) else values
 
 
 def outcomes_frame(
-    outcomes: Sequence[Outcome], cg: CompGraph, extra: Mapping[str, Sequence[Any]] = MappingProxyType({})
+    outcomes: Sequence[Outcome], cg: CompGraph, varied: Mapping[str, Sequence[Any]] = MappingProxyType({})
 ) -> pd.DataFrame:
     """Return a table with one row per outcome.
 
@@ -212,60 +272,39 @@ def outcomes_frame(
         The rows.
     cg
         The graph, which gives the order of sink tokens and functions.
-    extra
-        Columns by name, each with a value per outcome; they stand after ``name``.
+    varied
+        By hyperparameter that varies, a value per outcome; they stand after ``name``.
 
     Returns
     -------
     pandas.DataFrame
-        ``name``, ``series`` if there are some, of frames ``frame`` and ``time_s``, the extra columns, ``failure``
+        ``name``, ``series`` if there are some, of frames ``frame`` and ``time_s``, the varied columns, ``failure``
         (None, or what failed), one column per sink token, ``total_ms``, and ``"<function> ms"`` of what ran. A token
         that is called like another column has `` (token)`` after its name.
         Where nothing was found, or the run failed, the cell of the token is empty: None, NaN or NA.
     """
-    fixed = fixed_columns(outcomes)
-    columns: dict[str, Any] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= {column: _column(values) for column, values in _item_columns(outcomes).items()}
-    columns |= {column: object_column(values) for column, values in extra.items()}
-    columns["failure"] = object_column(
-        [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
-    )
-    for token in cg.sink_tokens:
-        is_taken = token in columns or token in fixed
-        columns[f"{token} (token)" if is_taken else token] = _column(
-            [outcome.values.get(token) for outcome in outcomes]
-        )
-    columns["total_ms"] = [outcome.total_ns / 1e6 for outcome in outcomes]
-    for function in cg.functions:
-        columns[f"{function} ms"] = [outcome.times_ns.get(function, math.nan) / 1e6 for outcome in outcomes]
-    return frame_of(columns)
+    return frame_of([
+        ("name", [outcome.name for outcome in outcomes], ""),
+        *((name, values, "") for name, values in _item_columns(outcomes).items()),
+        *((name, object_column(values), "hyperparameter") for name, values in varied.items()),
+        failure_column("" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes),
+        *((token, [outcome.values.get(token) for outcome in outcomes], "token") for token in cg.sink_tokens),
+        ("total_ms", [outcome.total_ns / 1e6 for outcome in outcomes], ""),
+        *(
+            (f"{function} ms", [outcome.times_ns.get(function, math.nan) / 1e6 for outcome in outcomes], "")
+            for function in cg.functions
+        ),
+    ])  # fmt: skip
 
 
-def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
-    """Return a pandas table of columns by name."""
-    with optional_import():
-        import pandas as pd
-    return pd.DataFrame(columns)
-
-
-def _column(values: list[Any]) -> Any:
-    """Return values as a column; integers and truth values of which some are missing stay what they are."""
-    kinds = {type(value) for value in values if value is not None}
-    if None in values and kinds in ({bool}, {int}):
-        with optional_import():
-            import pandas as pd
-        with suppress(OverflowError):  # above 64 bits
-            return pd.array(values, dtype="boolean" if bool in kinds else "Int64")
-    return values
-
-
-def object_column(values: Sequence[Any]) -> Any:
-    """Return values as a column; where None is one of them it stays None, since NaN is another value."""
-    if not any(value is None for value in values):
-        return values
-    with optional_import():
-        import pandas as pd
-    return pd.Series(list(values), dtype=object)
+def _item_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
+    """Return the columns that there are: of series if there are several or they have keys, of frames, and of times."""
+    columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in ("frame", "time_s")}
+    found = {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    series = [outcome.series for outcome in outcomes]
+    # Of the frames of one video the names say it.
+    has_series = len(set(series)) > 1 or ("frame" not in found and any(key != "" for key in series))
+    return {"series": series, **found} if has_series else found
 
 
 # -- tables as HTML -----------------------------------------------------------------------------------------------
@@ -277,79 +316,65 @@ _FAILURE_ROOM: Final = 300
 _LEFT: Final = ' style="text-align:left"'
 # A red that is read on a white and on a black ground; the mark has the same meaning.
 _FAILED: Final = ' style="text-align:left;color:var(--jp-error-color1,var(--vscode-errorForeground,#d9482b))"'
-HtmlCell = str | Thumbnail | None
+HtmlColumn = tuple[str, Sequence[str | Thumbnail | None]]
 
 
-def html_table(
-    caption: str,
-    head: Sequence[str],
-    rows: Sequence[Sequence[HtmlCell]],
-    failures: Sequence[str] = (),
-    *,
-    most: int = _MOST_ROWS,
-) -> str:
-    """Return a table of texts and pictures as HTML, with as many pictures as there is room for.
+def html_table(caption: str, columns: Iterable[HtmlColumn], failures: Sequence[str] = ()) -> str:
+    """Return a table of texts and pictures as HTML, with as many rows and pictures as there is room for.
 
     Parameters
     ----------
-    caption, head
-        Texts; a picture is described by its column and the first cell of its row.
-    rows
-        A cell per column.
+    caption
+        What stands above it.
+    columns
+        Titles, and a cell per row; a picture is described by its column and the first cell of its row.
     failures
         By row, what failed; empty texts where nothing did. These rows come first, and have one more column.
-    most
-        How many rows are shown.
     """
+    titles, cells = zip(*columns, strict=True)
+    rows = list(zip(*cells, strict=True))
     reasons = failures if any(failures) else [""] * len(rows)
-    order = sorted(range(len(rows)), key=lambda place: not reasons[place])
-    titles = [*head, *(["failure"] if any(failures) else [])]
-    lines = [f"<tr>{''.join(f'<th{_LEFT}>{content(title)}</th>' for title in titles)}</tr>"]
+    shown = sorted(range(len(rows)), key=lambda place: not reasons[place])[:_MOST_ROWS]
+    head = [*titles, *(["failure"] if any(failures) else [])]
+    lines = [f"<tr>{''.join(f'<th{_LEFT}>{content(title)}</th>' for title in head)}</tr>"]
     room = _ROOM_OF_PICTURES
-    for place in order[:most]:
+    for place in shown:
         painted = ""
-        for title, cell in zip(head, rows[place], strict=True):
-            element = _html_cell(cell, f"{title} of {rows[place][0]}")
+        for title, cell in zip(titles, rows[place], strict=True):
             if isinstance(cell, Thumbnail):
+                element = picture_element(cell, f"{title} of {rows[place][0]}: {cell.caption}", _CELL_ROOM)
                 element = element if len(element) <= room else ""
                 room -= len(element)
+            else:
+                element = content(fitted(cell or "", _CELL_ROOM))
             painted += f"<td{_LEFT}>{element}</td>"
         if any(failures):
-            reason = reasons[place]
-            painted += f"<td{_FAILED}>\u2717 {content(fitted(reason, _FAILURE_ROOM))}</td>" if reason else "<td></td>"
+            text = reasons[place]
+            painted += f"<td{_FAILED}>\u2717 {content(fitted(text, _FAILURE_ROOM))}</td>" if text else "<td></td>"
         lines.append(f"<tr>{painted}</tr>")
     above = f"<caption{_LEFT}>{content(fitted(caption, _FAILURE_ROOM))}</caption>" if caption else ""
-    more = f"<p>and {len(rows) - most} more: to_frame() has all of them</p>" if len(rows) > most else ""
+    left_out = len(rows) - len(shown)
+    more = f"<p>and {left_out} more: to_frame() has all of them</p>" if left_out else ""
     return f"<table>{above}{''.join(lines)}</table>{more}"
-
-
-def _html_cell(cell: HtmlCell, what: str) -> str:
-    if isinstance(cell, Thumbnail):
-        alt = escape(fitted(f"{what}: {cell.caption}", _CELL_ROOM))
-        return f'<img src="{data_uri(cell)}" alt="{alt}" title="{alt}">'
-    return content(fitted(cell or "", _CELL_ROOM))
 
 
 def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
     """Return a table of outcomes as HTML, with their thumbnails."""
+    of_items = _item_columns(outcomes)
+    columns: list[HtmlColumn] = [("name", [outcome.name for outcome in outcomes])]
+    if "series" in of_items:
+        columns.append(("series", list(map(value_text, of_items["series"]))))
+    if "time_s" in of_items:
+        times_s = of_items["time_s"]
+        columns.append(("time of the frame", ["" if time_s is None else f"{time_s:.3f} s" for time_s in times_s]))
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in outcomes)]
+    columns += [(token, [outcome.thumbnails.get(token) for outcome in outcomes]) for token in shown]
     # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
-    has_series, has_times = ("series" in _item_columns(outcomes), "time_s" in _item_columns(outcomes))
-    rows = [
-        [
-            outcome.name,
-            *([value_text(outcome.series)] if has_series else []),
-            *([] if not has_times else ["" if outcome.time_s is None else f"{outcome.time_s:.3f} s"]),
-            *(outcome.thumbnails.get(token) for token in shown),
-            *(_cell_text(outcome, token) for token in sinks),
-            duration_text(outcome.total_ns),
-        ]
-        for outcome in outcomes
-    ]
+    columns += [(token, [_cell_text(outcome, token) for outcome in outcomes]) for token in sinks]
+    columns.append(("time", [duration_text(outcome.total_ns) for outcome in outcomes]))
     failures = ["" if outcome.error_info is None else str(outcome.error_info) for outcome in outcomes]
-    times = [*(["series"] if has_series else []), *(["time of the frame"] if has_times else [])]
-    return html_table(caption, ["name", *times, *shown, *sinks, "time"], rows, failures)
+    return html_table(caption, columns, failures)
 
 
 def _cell_text(outcome: Outcome, token: str) -> str:

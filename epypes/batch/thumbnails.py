@@ -19,6 +19,7 @@ from epypes.display.previews.encoding import encode_small
 from epypes.display.previews.images import image_kind, is_image, sampled, sole_value
 from epypes.display.previews.preview import finished, looked_closer, sketch
 from epypes.display.previews.short import float_text
+from epypes.display.text import escape, fitted
 from epypes.display.views.surroundings import RunSurroundings
 from epypes.graph import CompGraph, colour_order
 from epypes.images import Order
@@ -183,9 +184,11 @@ def _mask_difference(got: Any, wanted: Any) -> Thumbnail:
 _LEAST_BYTES: Final = 400
 
 
-def data_uri(shown: Thumbnail) -> str:
-    """Return a thumbnail as the address that an image element of a page has."""
-    return f"data:{shown.media_type};base64,{base64.b64encode(shown.data).decode()}"
+def picture_element(shown: Thumbnail, text: str, room: int, width_px: int | None = None) -> str:
+    """Return a thumbnail as an image element of a page, described by a text of at most so many characters."""
+    alt, width = escape(fitted(text, room)), "" if width_px is None else f' width="{width_px}"'
+    address = f"data:{shown.media_type};base64,{base64.b64encode(shown.data).decode()}"
+    return f'<img src="{address}"{width} alt="{alt}" title="{alt}">'
 
 
 def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:

@@ -89,8 +89,21 @@ class Database:
     def __init__(self, given: str | Path) -> None:
         url = database_url(given)
         self.place = without_password(url)
-        self.engine = _create_engine(url)
         self._is_file = url.get_backend_name() == "sqlite"
+        # A file is opened for each transaction, since it may be another one by then.
+        # A server is pinged: it may have been restarted.
+        pool = sa.NullPool if self._is_file else None
+        try:
+            self.engine = sa.create_engine(
+                url, connect_args=connect_options(url), hide_parameters=True, pool_pre_ping=True, poolclass=pool
+            )
+        except (NoSuchModuleError, ImportError, ArgumentError) as error:
+            kind, driver = url.get_backend_name(), url.drivername.partition("+")[2]
+            way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
+            missing = getattr(error, "name", None)
+            reason = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {url.drivername!r}"
+            text = f"{self.place} can't be opened: {reason}. {way_out}, or store in a file: 'results.sqlite'."
+            raise StoreError(self.place, text) from None
         self._is_closed = self._has_tables = False
         # A store that is never closed, as in a notebook, leaves no connection behind.
         weakref.finalize(self, self.engine.dispose)
@@ -232,26 +245,6 @@ def connect_options(url: sa.URL) -> dict[str, Any]:
     if url.drivername in ("postgresql+psycopg", "postgresql+psycopg2"):
         return {"connect_timeout": _CONNECT_S, "tcp_user_timeout": 1000 * _BUSY_S}
     return {}
-
-
-def _create_engine(url: sa.URL) -> sa.Engine:
-    """Return what connects to a database; no connection is made yet."""
-    try:
-        # A file is opened for each transaction, since it may be another one by then.
-        # A server is pinged: it may have been restarted.
-        pool = sa.NullPool if url.get_backend_name() == "sqlite" else None
-        engine = sa.create_engine(
-            url, connect_args=connect_options(url), hide_parameters=True, pool_pre_ping=True, poolclass=pool
-        )
-    except (NoSuchModuleError, ImportError, ArgumentError) as error:
-        kind, driver = url.get_backend_name(), url.drivername.partition("+")[2]
-        way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
-        missing = getattr(error, "name", None)
-        reason = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {url.drivername!r}"
-        name = without_password(url)
-        text = f"{name} can't be opened: {reason}. {way_out}, or store in a file: 'results.sqlite'."
-        raise StoreError(name, text) from None
-    return engine
 
 
 # -- errors -----------------------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import StoreError
 from epypes.optional import optional_import
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _FLOAT: Final = "$float"
 
 
-class Store:
+class Store(AbstractContextManager["Store"]):
     """A database of series of rows; a context manager.
 
     Parameters
@@ -98,9 +98,6 @@ class Store:
         """Close it; a second time does nothing. It and its series can't be read or written any more."""
         self.database.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *_: object) -> None:
         self.close()
 
@@ -155,7 +152,7 @@ class Series:
         TypeError
             data contains an object that JSON has no type for.
         """
-        self.append_all([(key, data)])
+        self.put({key: self.encode(key, data)})
 
     def append_all(self, rows: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
         """Write several rows, as pairs of key and data: all of them, or none.

@@ -286,7 +286,7 @@ def test_the_table_has_a_row_per_check(result):
 
 
 def test_a_notebook_shows_what_was_expected_what_came_and_where_they_differ(result):
-    page = result._repr_html_()
+    page = result._repr_mimebundle_()["text/html"]
     assert page.index("a &lt;b&gt; &amp; c") < page.index("missing") < page.index("good")
     assert page.count("✗") == 2
     assert [f'alt="{name} of a &lt;b&gt; &amp; c' in page for name in ("expected", "got", "difference")] == [True] * 3
@@ -309,7 +309,7 @@ def test_one_pixel_that_differs_is_seen_in_the_picture_of_the_difference(runner)
 def test_many_failures_stay_a_small_page(runner, coins):
     label = np.random.default_rng(1).integers(0, 2, coins.shape, np.uint8) * 255
     result = ep.check(runner, [ep.Case(coins, {"mask": label}, name=f"case {number}") for number in range(120)])
-    page = result._repr_html_()
+    page = result._repr_mimebundle_()["text/html"]
     assert len(page) < 150_000
     assert "and 20 more: to_frame() has all of them" in page
 
@@ -372,4 +372,4 @@ def test_a_check_of_nothing_passes_where_nothing_is_expected_and_falls_short_els
     assert result.cases == {"none": True, "some": False, "too many": False}
     assert reasons(result)["some", "iou of mask"] == "nothing was found of 'mask'"
     assert all(outcome.error_info is None for outcome in result.failures)
-    assert "nothing was found" in result._repr_html_()
+    assert "nothing was found" in result._repr_mimebundle_()["text/html"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.items import Item, count_of, items_of, payload_of
+from epypes.batch.items import Item, image_set, items_of, payload_of
 from epypes.errors import ImageFileError, ScaleError
 
 
@@ -145,6 +145,6 @@ def test_a_text_by_token_is_a_file_if_it_has_the_ending_of_one_and_is_there(fold
 
 
 def test_how_many_there_are_is_known_without_going_through_them(folder, crops):
-    assert count_of(folder) == 12
-    assert count_of(crops) == 12
-    assert count_of(iter(crops)) is None
+    assert image_set(folder).count == 12
+    assert image_set(crops).count == 12
+    assert image_set(iter(crops)).count is None

@@ -13,7 +13,7 @@ import pytest
 
 import epypes as ep
 from epypes.acquisition import Video, read_image
-from epypes.batch.items import count_of, items_of
+from epypes.batch.items import image_set, items_of
 from epypes.errors import ImageFileError, ScaleError
 from tests.calls import log_to
 from tests.videos import with_damage, write_video
@@ -146,7 +146,7 @@ def test_lists_globs_and_generators_may_have_videos(video, tmp_path, runner):
     names = [f"belt.avi #{n}" for n in range(COUNT)] + [f"celt.avi #{n}" for n in range(3)]
     assert [outcome.name for outcome in ep.map(runner, str(tmp_path / "[bc]elt.avi"))] == names
     mixed = [video, image, str(tmp_path / "still.png"), ep.video(other)[1:], {"image": str(other)}]
-    assert count_of(mixed) == COUNT + 1 + 1 + 2 + 3
+    assert image_set(mixed).count == COUNT + 1 + 1 + 2 + 3
     for given in (mixed, iter(mixed)):
         result = ep.map(runner, given, keep="seen")
         assert seen(result) == [*range(COUNT), 0, 0, 1, 2, 0, 1, 2]
