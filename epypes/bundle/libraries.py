@@ -15,15 +15,13 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
-import importlib
+import operator
 import sys
 import types
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from epypes.bundle.resolve import evaluated
 from epypes.run.snapshot import is_own
 
 Attributes = Mapping[str, Mapping[str, str]]
@@ -36,7 +34,7 @@ _MOST_TEXT: Final = 60
 _MOST_ENTRIES: Final = 500
 _MOST_BYTES: Final = 65_536
 # They hold the interpreter's own state, which is another one in each kind of process.
-_OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
+OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
 # What these put into other modules, every notebook has.
 _OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
 # A name in modules that pytest has compiled otherwise, as it does with tests and plugins.
@@ -48,13 +46,41 @@ _ALWAYS: Final = frozenset({"builtins", "numpy"})
 # -- settings --------------------------------------------------------------------------------------------------------
 
 
+class Setting(NamedTuple):
+    """How Python or a library is set in this process, where that changes what functions compute.
+
+    Attributes
+    ----------
+    name
+        What sets it, as a reason names it.
+    module
+        The module that has it; it is looked at only where this is loaded.
+    reader
+        Returns, of the module, what reads the setting as a value to compare.
+    write
+        Sets it, of the module and a value that was read.
+    words
+        It is compared after each call of a function whose code has one of these names; of every function if there are
+        none.
+    texts
+        Returns a value as texts by name, which promotion compares with those of a fresh process; None where that has
+        another value anyway.
+    """
+
+    name: str
+    module: str
+    reader: Callable[[Any], Callable[[], Any]]
+    write: Callable[[Any, Any], object]
+    words: frozenset[str] = frozenset()
+    texts: Callable[[Any], dict[str, str]] | None = None
+
+
 def library_settings() -> dict[str, str]:
-    """Return how Python and libraries are set in this process, where that changes what functions compute."""
+    """Return how Python and libraries are set in this process, as texts by name."""
     found: dict[str, str] = {}
-    with warnings.catch_warnings(action="ignore"):  # of options that are deprecated
-        for module, read in _SETTINGS:
-            if module in sys.modules:
-                found |= read(sys.modules[module])
+    for setting in SETTINGS:
+        if setting.texts is not None and setting.module in sys.modules:
+            found |= setting.texts(setting.reader(sys.modules[setting.module])())
     return found
 
 
@@ -63,66 +89,165 @@ def is_of_texts(setting: str) -> bool:
     return setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
 
 
-def _of_warnings(warnings: Any) -> dict[str, str]:
-    kinds = [kind for action, _, kind, *_ in warnings.filters if action == "error"]
+def _filters_text(filters: Any) -> dict[str, str]:
+    kinds = [kind for action, _, kind, *_ in filters if action == "error"]
     own = (kind for kind in kinds if isinstance(kind, type) and not kind.__module__.startswith(_OF_NOTEBOOKS))
     return {WARNINGS: ", ".join(f"{kind.__name__} is an error" for kind in own)}
 
 
-def _of_numpy(numpy: Any) -> dict[str, str]:
-    raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
-    return {
-        "numpy.seterr": f"{raising or 'no errors are raised'}",
-        "numpy.set_printoptions": f"{numpy.get_printoptions()}",
-    }
+def _set_filters(warnings: Any, filters: Any) -> None:
+    warnings.simplefilter("ignore", append=True)  # has Python forget what it has decided by the old ones
+    warnings.filters[:] = filters
 
 
-def _of_decimal(decimal: Any) -> dict[str, str]:
+def _errors_text(errors: Mapping[str, str]) -> dict[str, str]:
+    raising = {error: way for error, way in errors.items() if way not in ("ignore", "warn", "print", "log")}
+    return {"numpy.seterr": f"{raising or 'no errors are raised'}"}
+
+
+_PARTS_OF_DECIMAL: Final = "prec", "rounding", "Emin", "Emax", "capitals", "clamp"
+
+
+def _decimal_reader(decimal: Any) -> Callable[[], Any]:
+    parts, context_of = operator.attrgetter(*_PARTS_OF_DECIMAL), decimal.getcontext
+    return lambda: (*parts(context := context_of()), dict(context.traps))
+
+
+def _set_decimal(decimal: Any, value: Any) -> None:
     context = decimal.getcontext()
-    parts = "prec", "rounding", "Emin", "Emax", "capitals", "clamp"
-    traps = sorted(signal.__name__ for signal, is_on in context.traps.items() if is_on)
-    text = ", ".join(f"{part}={getattr(context, part)}" for part in parts)
+    for part, saved in zip(_PARTS_OF_DECIMAL, value, strict=False):
+        setattr(context, part, saved)
+    context.traps.update(value[-1])
+
+
+def _decimal_text(value: Any) -> dict[str, str]:
+    traps = sorted(signal.__name__ for signal, is_on in value[-1].items() if is_on)
+    text = ", ".join(f"{part}={saved}" for part, saved in zip(_PARTS_OF_DECIMAL, value, strict=False))
     return {"decimal.getcontext": f"{text}, traps={' '.join(traps)}"}
 
 
-def _of_locale(locale: Any) -> dict[str, str]:
-    # All numbers, dates and orders of C.UTF-8 are those of C.
-    parts = {part: locale.setlocale(getattr(locale, part)) for part in ("LC_NUMERIC", "LC_TIME", "LC_COLLATE")}
-    others = (f"{part}={name}" for part, name in parts.items() if name.partition(".")[0] not in ("C", "POSIX"))
+_PARTS_OF_LOCALE: Final = "LC_NUMERIC", "LC_TIME", "LC_COLLATE", "LC_CTYPE"
+
+
+def _set_locale(locale: Any, parts: Mapping[str, str]) -> None:
+    for part, name in parts.items():
+        locale.setlocale(getattr(locale, part), name)
+
+
+def _locale_text(parts: Mapping[str, str]) -> dict[str, str]:
+    # All numbers, dates and orders of C.UTF-8 are those of C; the encoding is another one in each kind of process.
+    named = ((part, name) for part, name in parts.items() if part != "LC_CTYPE")
+    others = (f"{part}={name}" for part, name in named if name.partition(".")[0] not in ("C", "POSIX"))
     return {"locale.setlocale": ", ".join(others)}
 
 
-def _of_pandas(pandas: Any) -> dict[str, str]:
-    # Without what pandas sets by what shows it.
-    left_out = "display.encoding", "display.max_columns"
-    options = (option for option in _options(pandas.options) if option[0] not in left_out)
-    return {f"pandas.set_option {name}": f"{value!r}" for name, value in options}
-
-
-def _options(options: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _pandas_options(options: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
     for name in dir(options):
         value = getattr(options, name)
-        if type(value) is type(options):
-            yield from _options(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
+        is_group = type(value) is type(options)
+        found |= {f"{name}.{key}": part for key, part in _pandas_options(value).items()} if is_group else {name: value}
+    return found
 
 
-def _of_matplotlib(matplotlib: Any) -> dict[str, str]:
-    # Without what notebooks set themselves.
-    left_out = ("backend", "interactive")
-    parameters = {name: matplotlib.rcParams[name] for name in matplotlib.rcParams if not name.startswith(left_out)}
-    return {f"matplotlib.rcParams {name}": f"{value!r}" for name, value in parameters.items()}
+def _pandas_reader(pandas: Any) -> Callable[[], Any]:
+    def read() -> dict[str, Any]:
+        with warnings.catch_warnings(action="ignore"):  # of options that are deprecated
+            return _pandas_options(pandas.options)
+
+    return read
 
 
-_SETTINGS: Final[tuple[tuple[str, Callable[[Any], dict[str, str]]], ...]] = (
-    ("warnings", _of_warnings),
-    ("numpy", _of_numpy),
-    ("decimal", _of_decimal),
-    ("locale", _of_locale),
-    ("cv2", lambda cv2: {"cv2.setUseOptimized": f"{cv2.useOptimized()}"}),
-    ("pandas", _of_pandas),
-    ("matplotlib", _of_matplotlib),
+def _set_pandas_options(pandas: Any, options: Mapping[str, Any]) -> None:
+    for name, value in options.items():
+        if pandas.get_option(name) != value:
+            pandas.set_option(name, value)
+
+
+def _texts_of(prefix: str, left_out: tuple[str, ...]) -> Callable[[Mapping[str, Any]], dict[str, str]]:
+    """Return what writes options as texts, but for those that pandas or a notebook sets itself."""
+    return lambda options: {
+        f"{prefix} {name}": f"{value!r}" for name, value in options.items() if not name.startswith(left_out)
+    }
+
+
+def _set_environment(os: Any, variables: Mapping[bytes, bytes]) -> None:
+    os.environ.clear()
+    os.environ.update({os.fsdecode(name): os.fsdecode(value) for name, value in variables.items()})
+
+
+SETTINGS: Final = (
+    Setting(
+        "sys.setrecursionlimit",
+        "sys",
+        lambda sys: sys.getrecursionlimit,
+        lambda sys, value: sys.setrecursionlimit(value),
+    ),
+    Setting(
+        "sys.set_int_max_str_digits",
+        "sys",
+        lambda sys: sys.get_int_max_str_digits,
+        lambda sys, value: sys.set_int_max_str_digits(value),
+    ),
+    Setting(WARNINGS, "warnings", lambda warnings: lambda: warnings.filters, _set_filters, texts=_filters_text),
+    Setting("cv2.setNumThreads", "cv2", lambda cv2: cv2.getNumThreads, lambda cv2, value: cv2.setNumThreads(value)),
+    Setting(
+        "cv2.setUseOptimized",
+        "cv2",
+        lambda cv2: cv2.useOptimized,
+        lambda cv2, value: cv2.setUseOptimized(value),
+        texts=lambda value: {"cv2.setUseOptimized": f"{value}"},
+    ),
+    Setting(
+        "os.environ",
+        "os",
+        lambda os: lambda: os.environ._data,  # as bytes: to decode all variables takes 20 us
+        _set_environment,
+        frozenset({"os"}),
+    ),
+    Setting("os.chdir", "os", lambda os: os.getcwd, lambda os, value: os.chdir(value), frozenset({"os"})),
+    Setting(
+        "locale.setlocale",
+        "locale",
+        lambda locale: lambda: {part: locale.setlocale(getattr(locale, part)) for part in _PARTS_OF_LOCALE},
+        _set_locale,
+        frozenset({"locale"}),
+        _locale_text,
+    ),
+    Setting("decimal.getcontext", "decimal", _decimal_reader, _set_decimal, frozenset({"decimal"}), _decimal_text),
+    # From NumPy 2 on these are variables of the context, which are all compared.
+    Setting(
+        "numpy.seterr",
+        "numpy",
+        lambda numpy: numpy.geterr,
+        lambda numpy, value: numpy.seterr(**value),
+        frozenset({"seterr"}),
+        _errors_text,
+    ),
+    Setting(
+        "numpy.set_printoptions",
+        "numpy",
+        lambda numpy: numpy.get_printoptions,
+        lambda numpy, value: numpy.set_printoptions(**value),
+        frozenset({"set_printoptions"}),
+        lambda value: {"numpy.set_printoptions": f"{value}"},
+    ),
+    Setting(
+        "pandas.set_option",
+        "pandas",
+        _pandas_reader,
+        _set_pandas_options,
+        frozenset({"set_option", "reset_option", "options"}),
+        _texts_of("pandas.set_option", ("display.encoding", "display.max_columns")),
+    ),
+    Setting(
+        "matplotlib.rcParams",
+        "matplotlib",
+        lambda matplotlib: lambda: dict(matplotlib.rcParams),
+        lambda matplotlib, value: matplotlib.rcParams.update(value),
+        frozenset({"rcParams", "rc", "rcdefaults", "use"}),
+        _texts_of("matplotlib.rcParams", ("backend", "interactive")),
+    ),
 )
 
 
@@ -141,31 +266,9 @@ def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes
     """
     own = {name.partition(".")[0] for name in named}
     packages = own | _ALWAYS | ({name.partition(".")[0] for name in new} - sys.stdlib_module_names)
-    packages = {name for name in packages - _OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
+    packages = {name for name in packages - OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
     # The user's own modules are looked at by what the functions refer to.
     return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages and not is_own(name))
-
-
-def load_named(text: str, own: Collection[str] = ()) -> None:
-    """Load what a bundle names of libraries that load their parts when these are first asked for; none of its own."""
-    nodes, names = [*ast.walk(ast.parse(text))], {**sys.modules}
-    for node in nodes:
-        if not isinstance(node, ast.Import | ast.ImportFrom):
-            continue
-        for alias in node.names:
-            home = alias.name if isinstance(node, ast.Import) else "." * node.level + (node.module or "")
-            if home.partition(".")[0] in {"", *own}:
-                continue
-            with suppress(Exception):  # whatever a module raises that no sample has imported
-                if isinstance(node, ast.ImportFrom):
-                    source = importlib.import_module(node.module or "")
-                    names[alias.asname or alias.name] = getattr(source, alias.name)
-                else:
-                    names[alias.asname or alias.name] = importlib.import_module(alias.name)
-    for node in nodes:
-        if isinstance(node, ast.Attribute):
-            with suppress(Exception):
-                evaluated(node, names)
 
 
 def attributes_of(modules: Iterable[str]) -> Attributes:
@@ -174,10 +277,20 @@ def attributes_of(modules: Iterable[str]) -> Attributes:
     return {name: dict(_attributes(module, name)) for name, module in loaded.items() if _OF_PYTEST not in vars(module)}
 
 
-def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[tuple[str, str], tuple[str, str]]:
+def changed_attributes(
+    here: Attributes, there: Attributes, text: str, named_here: Collection[str]
+) -> dict[tuple[str, str], tuple[str, str]]:
     """Return by module and attribute what differs here from there, as the descriptions of both.
 
-    What is only here counts if a bundle's text names it; what was not yet computed there does not.
+    Parameters
+    ----------
+    here, there
+        What modules hold in two processes.
+    text
+        A bundle's code. What is only here counts if it names it.
+    named_here
+        The names that the notebook may have given another value. Private values, and those that are no constants and
+        not named by the bundle, are mostly what libraries count and remember: they count if they are among these.
     """
     mentioned = _mentioned(text)
     found: dict[tuple[str, str], tuple[str, str]] = {}
@@ -191,11 +304,12 @@ def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[t
                 is_lazy = value.startswith((f"{module.partition('.')[0]}.", "module "))
                 is_changed = last in mentioned and not is_lazy
             else:
-                is_changed = other not in ("None", value) and not value.startswith(_OF_NOTEBOOKS)
-                # Not what a loop over a set has left behind in a module.
-                is_changed &= last.isupper() or "." in name or last in mentioned or f".{last}" in other
-                # Nor what libraries do to each other.
+                # Not what a loop over a set has left behind in a module, nor what libraries do to each other.
+                is_changed = last.isupper() or "." in name or last in mentioned or f".{last}" in other
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
+                is_changed |= last in named_here
+                is_changed &= other != value and (other != "None" or last in named_here)
+                is_changed &= not value.startswith(_OF_NOTEBOOKS)
             if is_changed:
                 found[module, name] = value, other
     return found
@@ -219,8 +333,6 @@ def _attributes(owner: Any, home: str, prefix: str = "") -> Iterator[tuple[str, 
     for name, value in [*vars(owner).items()]:
         is_function = isinstance(value, (type, *_FUNCTIONS)) or type(value) in _INNER
         if name.startswith("_repr_") or (name.startswith("__") and (not prefix or not is_function)):
-            continue
-        if name.startswith("_") and not is_function:
             continue
         yield f"{prefix}{name}", _described(value)
         if isinstance(value, type) and value.__module__ == home and value.__qualname__ == f"{prefix}{name}":

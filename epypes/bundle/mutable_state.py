@@ -29,16 +29,21 @@ running: to wait for one of them could be to wait for its own caller.
 
 from __future__ import annotations
 
+import copy
 import dis
 import functools
+import itertools
 import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from contextvars import ContextVar
+from contextvars import Context, ContextVar, copy_context
+from enum import Enum
+from logging import Logger
 from typing import Any, Final
 
+from epypes.bundle.libraries import OF_THE_PROCESS, SETTINGS, Setting
 from epypes.bundle.private_import import import_module, plain_name
 from epypes.bundle.references import (
     cells_of,
@@ -80,6 +85,11 @@ _OF_PYTHON: Final = frozenset(
     | {"_value2member_map_", "__slotnames__"}
 )
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
+# Which logger is above one, and which levels are on, changes when others are made.
+_OF_A_LOGGER: Final = frozenset({"parent", "_cache"})
+# By these code binds names that its instructions don't say.
+_BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
+_SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
 
@@ -114,14 +124,22 @@ class CodeSnapshot(Snapshot):
         self._code: set[str] = set()  # its names and instructions
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
+        # The modules, classes and functions of libraries that the code names.
+        self._of_libraries: dict[int, tuple[str, Any]] = {}
         super().__init__(functions)
         for needed, add in self._possible:
             if needed & self._code:
                 add()
         self._possible.clear()
+        self._compare_libraries()
 
     def __bool__(self) -> bool:
         return bool(self.records or self.resets or self._caches)
+
+    @property
+    def words(self) -> frozenset[str]:
+        """The names that the code has, and those of the libraries whose objects it names."""
+        return frozenset(self._code)
 
     def changed(self) -> str | None:
         """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
@@ -155,6 +173,10 @@ class CodeSnapshot(Snapshot):
     def look_at(self, name: str, value: Any) -> Found:
         """Look into code too."""
         kind = type(value)
+        home = value.__name__ if kind is types.ModuleType else getattr(value, "__module__", None)
+        if isinstance(home, str):
+            top = home.partition(".")[0]
+            self._code |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
         if kind is types.FunctionType:
             return self._look_at_function(value)
         if issubclass(kind, type):
@@ -178,6 +200,10 @@ class CodeSnapshot(Snapshot):
             lazy = cached_properties(kind)
             if lazy:
                 self.resets.append(functools.partial(_forget, value, lazy))
+            if issubclass(kind, Enum):
+                self._compare(_BINDS, functools.partial(_Bindings, f"{kind.__name__}.{value.name}.", value))
+        elif kind is Logger:
+            self.records.append(_Bindings(f"{name}.", value))
         elif is_model_of_cv2(value):
             self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
@@ -197,6 +223,7 @@ class CodeSnapshot(Snapshot):
     def _look_at_function(self, function: types.FunctionType) -> Found:
         known, code = function.__globals__, function.__code__
         if not is_own(str(known.get("__name__"))):
+            self._of_libraries[id(function)] = f"{function.__name__}.", function
             yield from _wrapped_by(function)
             return
         _check_caches(known)
@@ -221,8 +248,8 @@ class CodeSnapshot(Snapshot):
         yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
 
     def _note_instructions(self, code: types.CodeType) -> None:
-        """Note the names of some code, and the instructions by which it binds them."""
-        self._code.update(code.co_names)
+        """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
+        self._code.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
             if operation.startswith(("STORE_", "DELETE_")):
@@ -233,10 +260,14 @@ class CodeSnapshot(Snapshot):
         if is_own(str(kind.__module__)):
             yield from self._look_at_names(f"{kind.__name__}.", kind)
             yield from ((base.__name__, base) for base in kind.__bases__)
+        else:
+            self._of_libraries[id(kind)] = f"{kind.__name__}.", kind
 
     def _look_at_module(self, module: types.ModuleType) -> Found:
         if is_own(module.__name__):
             yield from self._look_at_names(f"{plain_name(module.__name__)}.", vars(module))
+        else:
+            self._of_libraries[id(module)] = f"{module.__name__}.", module
 
     def _look_at_names(self, prefix: str, owner: Any) -> Found:
         _check_caches(owner)
@@ -265,6 +296,24 @@ class CodeSnapshot(Snapshot):
             else:
                 self._caches.append((name, cached, values))
         yield name, cached.__wrapped__
+
+    def _compare_libraries(self) -> None:
+        """Compare what the code may bind in the libraries that it names: all of it, or what its instructions say."""
+        stored = frozenset(word.partition(" ")[2] for word in self._code if word[:10] in ("STORE_ATTR", "DELETE_ATT"))
+        names = None if _BINDS_BY_TEXT & self._code else stored
+        waiting = [*self._of_libraries.values()] if names is None or names else []
+        while waiting:
+            prefix, owner = waiting.pop()
+            if prefix.partition(".")[0] not in OF_THE_PROCESS:
+                self.records.append(_LibraryBindings(prefix, owner, names))
+            if isinstance(owner, types.ModuleType):
+                for name in self._code & vars(owner).keys():
+                    part = vars(owner)[name]
+                    is_new = id(part) not in self._of_libraries
+                    if is_new and isinstance(part, types.ModuleType | types.FunctionType | type):
+                        self._of_libraries[id(part)] = found = f"{prefix}{name}.", part
+                        waiting.append(found)
+        self._of_libraries.clear()
 
     def _compare(self, needed: frozenset[str], make: Callable[[], Record]) -> None:
         """Compare an object if the code has one of the names or instructions."""
@@ -323,11 +372,51 @@ class _Bindings(Record):
         ]
 
 
+class _LibraryBindings(_Bindings):
+    """The names of a library's module, or the attributes of its class or function: all, or those with some names.
+
+    What a library adds itself, such as a part that is loaded when it is first asked for, is no change.
+    """
+
+    __slots__ = ("names",)
+
+    def __init__(self, name: str, value: Any, names: frozenset[str] | None) -> None:
+        self.names = names
+        Record.__init__(self, name, value, self._read, self._write)
+
+    def _read(self, value: Any) -> tuple[Any, ...]:
+        found = _bound(value) if self.names is None else _some_bound(value, self.names)
+        return *found, *found.values()
+
+    def _others(self, now: tuple[Any, ...]) -> list[str]:
+        before, after = as_dict(self.saved), as_dict(now)
+        return [name for name in super()._others(now) if name in before or not _is_of_library(after[name])]
+
+    def _write(self, value: Any, saved: tuple[Any, ...]) -> None:
+        before, now = as_dict(saved), as_dict(self._read(value))
+        for name in self._others((*now, *now.values())):
+            if name in before:
+                setattr(value, name, before[name])
+            else:
+                delattr(value, name)
+
+
+def _is_of_library(value: Any) -> bool:
+    """Whether a value is a module, class or function that is not the user's."""
+    is_code = isinstance(value, types.ModuleType | types.FunctionType | types.BuiltinFunctionType | type)
+    return is_code and not is_own(str(getattr(value, "__module__", None) or getattr(value, "__name__", "")))
+
+
+def _some_bound(value: Any, names: frozenset[str]) -> dict[str, Any]:
+    known, parts = vars(value), names.intersection(_PARTS_OF_A_FUNCTION) if type(value) is types.FunctionType else ()
+    return {name: known[name] for name in names & known.keys()} | {name: getattr(value, name) for name in parts}
+
+
 def _bound(value: Any) -> dict[str, Any]:
     """Return the names of a module, or the attributes of an object that are the user's."""
     if type(value) is dict:
         return value
-    skipped = _OF_A_NODE if isinstance(value, Node) else _OF_PYTHON
+    skipped = _OF_A_NODE if isinstance(value, Node) else _OF_A_LOGGER if type(value) is Logger else _OF_PYTHON
     found = {name: part for name, part in vars(value).items() if name not in skipped and name[:9] != "__epypes_"}
     if type(value) is types.FunctionType:
         found |= {name: getattr(value, name) for name in _PARTS_OF_A_FUNCTION}
@@ -423,7 +512,7 @@ class MutableState:
     """
 
     def __init__(self, functions: Mapping[str, Callable[..., Any]], hyperparameters: Mapping[str, Any]) -> None:
-        self._lock = _ReadersWriterLock()
+        self._lock, self._settings = _ReadersWriterLock(), _Settings()
         self._shared = {
             f"hyperparameter {token}": value for token, value in hyperparameters.items() if _has_containers(value)
         }
@@ -450,9 +539,12 @@ class MutableState:
             return function
         function = _checked(function)
         snapshot = CodeSnapshot({**self._shared, name: function}, self._compared)
-        if not snapshot:
+        self._settings.add(snapshot.words)
+        is_code = type(function) in (types.FunctionType, functools.partial, _CACHED)
+        is_of_library = not isinstance(function, Node) and not is_own(str(getattr(function, "__module__", "")))
+        if is_of_library and not snapshot and not self._settings.is_set_by(function):
             return function
-        if type(function) in (types.FunctionType, functools.partial, _CACHED):
+        if is_code and not (is_of_library and type(function) is types.FunctionType):
             # It stays what the module defines, so that it can be promoted again.
             setattr(function, WATCH, functools.partial(self._guarded_call, function=function, snapshot=snapshot))
             self._refer_to(snapshot.nodes)
@@ -472,17 +564,8 @@ class MutableState:
     def _guarded_call(
         self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
     ) -> Callable[..., Any]:
-        lock, referred = self._lock, self._referred
-
-        def attempt(args: Any, kwargs: Any) -> tuple[Any, BaseException | None]:
-            token = _held.set(lock)
-            try:
-                return function(*args, **kwargs), None
-            except BaseException as error:
-                return None, error
-            finally:
-                _held.reset(token)
-                snapshot.reset()
+        lock, referred, settings, has_resets = self._lock, self._referred, self._settings, bool(snapshot.resets)
+        attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -490,24 +573,29 @@ class MutableState:
             ticket = lock.acquire_read(only_if_free=id(node) in referred) if _held.get() is not lock else None
             if ticket is None:
                 return function(*args, **kwargs)
-            is_exclusive, is_restored = bool(snapshot.resets), True
+            is_exclusive, is_restored, token = has_resets, True, _held.set(lock)
             try:
                 if is_exclusive:
                     lock.upgrade(ticket)
                     if snapshot.changed() is not None:  # by a call that waits to put it back
                         snapshot.restored()
-                result, error = attempt(args, kwargs)
-                changed = snapshot.changed()
-                if changed is not None and not is_exclusive:
-                    is_exclusive = True
-                    if not lock.upgrade(ticket):
-                        snapshot.restored()
-                        result, error = attempt(args, kwargs)
-                        changed = snapshot.changed()
+                result, error, changed = attempt(args, kwargs)
                 if changed is not None:
-                    is_restored = snapshot.restored()
+                    was_alone = is_exclusive or lock.upgrade(ticket)
+                    is_exclusive = True
+                    if not was_alone or not settings.is_known():
+                        found, first = settings.now(), (result, error)
+                        snapshot.restored()
+                        settings.restored()
+                        result, error, changed = attempt(args, kwargs)
+                        if was_alone and changed is None:  # they were set between two calls
+                            settings.set_to(found)
+                            result, error = first
+                        del first
+                    is_restored = changed is None or snapshot.restored() & settings.restored()
             finally:
-                lock.release(is_exclusive)
+                _held.reset(token)
+                lock.release(ticket, is_exclusive)
             try:
                 if error is not None:
                     raise error
@@ -515,7 +603,6 @@ class MutableState:
                     raise StateChanged(name, changed, is_restored)
                 return result
             finally:
-                # The exception refers to this frame, which refers to the exception, and to the images of the call.
                 del error, result
 
         vars(call).pop(WATCH, None)
@@ -523,52 +610,166 @@ class MutableState:
         return call
 
 
+_Outcome = tuple[Any, BaseException | None, str | None]
+
+
+def _attempt(
+    function: Callable[..., Any], snapshot: CodeSnapshot | None, settings: _Settings, args: Any, kwargs: Any
+) -> _Outcome:
+    """Call a function; return its result, what it has raised, and what it has changed that outlives the call."""
+    # What the call sets in the context is gone with that.
+    context, modules, error = copy_context(), len(sys.modules), None
+    try:
+        result = context.run(function, *args, **kwargs)
+    except BaseException as raised:
+        result, error = None, raised
+    changed = None
+    if snapshot is not None:
+        snapshot.reset()
+        changed = snapshot.changed()
+    try:
+        return result, error, settings.changed(context, modules) if changed is None else changed
+    finally:
+        # The exception refers to this frame, which refers to the exception, and to the images of the call.
+        del error, result
+
+
+class _Settings:
+    """How Python and libraries are set, and the context, as calls find them and leave them."""
+
+    def __init__(self) -> None:
+        self._compared: list[Setting] = []
+        # What reads each of them, and what it has read.
+        self._known: list[tuple[Callable[[], Any], Any]] = []
+        self.add(frozenset())
+
+    def add(self, words: frozenset[str]) -> None:
+        """Compare from now on what code with these names may set, and what is always compared."""
+        loaded = (one for one in SETTINGS if one.module in sys.modules)
+        self._compared = [one for one in loaded if one in self._compared or not one.words or one.words & words]
+        self._known = [(one.reader(sys.modules[one.module]), None) for one in self._compared]
+        self._known = self.now()
+
+    @staticmethod
+    def is_set_by(function: Any) -> bool:
+        """Whether a function of a library is one that sets something."""
+        name = getattr(function, "__name__", "")
+        return any(name == one.name.rpartition(".")[2] for one in SETTINGS)
+
+    def is_known(self) -> bool:
+        """Whether all settings are as they are known."""
+        for read, known in self._known:  # noqa: SIM110 - all() takes twice as long
+            if read() != known:
+                return False
+        return True
+
+    def now(self) -> list[tuple[Callable[[], Any], Any]]:
+        """Return the settings as they are now, for ``set_to``."""
+        return [(read, copy.copy(read())) for read, _ in self._known]
+
+    def set_to(self, known: list[tuple[Callable[[], Any], Any]]) -> None:
+        """Set all as they were, and know them so from now on."""
+        self._known = known
+        self.restored()
+
+    def changed(self, context: Context, modules: int) -> str | None:
+        """Return what a call has set, in its context or elsewhere; None if nothing is set otherwise than before.
+
+        What a module sets when it is imported is put back, and is no change: ``modules`` is how many there were.
+        """
+        now = copy_context()
+        if self.is_known() and context == now:
+            return None
+        name = _set_in(context, now) or next((one.name for one, _ in self._others()), None)
+        if len(sys.modules) > modules:
+            self.restored()
+            return None
+        return name
+
+    def _others(self) -> Iterator[tuple[Setting, Any]]:
+        for one, (read, known) in zip(self._compared, self._known, strict=True):
+            if read() != known:
+                yield one, known
+
+    def restored(self) -> bool:
+        """Put the settings back, and return whether that was possible."""
+        for one, known in self._others():
+            with suppress(Exception):
+                one.write(sys.modules[one.module], known)
+        return self.is_known()
+
+
+# The names of variables of a context, and what sets them.
+_SET_BY: Final = {"numpy.ufunc.extobj": "numpy.seterr", "format_options": "numpy.set_printoptions"}
+
+
+def _set_in(context: Context, now: Context) -> str | None:
+    """Return which variable of a context has another value than now, or what sets it; None if there is none."""
+    for variable in {**context, **now}:
+        before, after = (each.get(variable, _NO_VALUE) for each in (now, context))
+        # Python makes the context of decimal numbers when it is first asked for.
+        if after is not before and not (variable.name == "decimal_context" and before is _NO_VALUE):
+            return _SET_BY.get(variable.name, f"ContextVar {variable.name}")
+    return None
+
+
+_NO_VALUE: Final = object()
+
+
 class _ReadersWriterLock:
     """A lock that calls share as readers, each of which may become the writer, which has the objects alone.
 
     Readers that wait to become the writer count as ended, so they don't wait for one another. No reader begins then.
+    To begin and to end as a reader takes no lock: the dict of those that run is changed in one step each time.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.Lock())
-        # Readers that are running; those that are, or wait to become, the writer; readers begun so far.
-        self._running = self._writers = self._begun = 0
+        # The readers that are running, by number; how many are, or wait to become, the writer; the number begun last.
+        self._running: dict[int, bool] = {}
+        self._writers = self._begun = 0
+        self._numbers = itertools.count(1)
 
     def acquire_read(self, *, only_if_free: bool = False) -> int | None:
-        """Begin as a reader; return a ticket for ``upgrade``: 0 if others are running.
+        """Begin as a reader; return a ticket for ``upgrade`` and ``release``: a negative one if others are running.
 
         With ``only_if_free`` nothing is acquired, and None is returned, where others are running.
         """
-        with self._changed:
+        while True:
             if only_if_free and (self._running or self._writers):
                 return None
-            while self._writers:
-                self._changed.wait()
-            self._running += 1
-            self._begun += 1
-            return self._begun if self._running == 1 else 0
+            number = next(self._numbers)
+            self._running[number] = True
+            self._begun = number
+            if not self._writers:
+                return number if len(self._running) == 1 else -number
+            with self._changed:
+                del self._running[number]
+                self._changed.notify_all()
+                while self._writers:
+                    self._changed.wait()
 
     def upgrade(self, ticket: int) -> bool:
         """Become the writer when all other readers have ended; return whether none ran since the ticket was given."""
         with self._changed:
             was_alone = ticket == self._begun
             self._writers += 1
-            self._running -= 1
+            del self._running[abs(ticket)]
             self._changed.notify_all()
             try:
                 while self._running:
                     self._changed.wait()
             finally:
-                self._running += 1
+                self._running[abs(ticket)] = True
             return was_alone
 
-    def release(self, is_writer: bool) -> None:
+    def release(self, ticket: int, is_writer: bool) -> None:
         """End as a reader or as the writer."""
-        with self._changed:
-            self._running -= 1
-            if self._writers:
+        del self._running[abs(ticket)]
+        if self._writers:
+            with self._changed:
+                self._writers -= is_writer
                 self._changed.notify_all()
-            self._writers -= is_writer
 
 
 def _has_containers(value: Any) -> bool:

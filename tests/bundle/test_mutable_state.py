@@ -8,6 +8,7 @@ import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 
@@ -139,6 +140,70 @@ KEPT = {
     ),
 }  # fmt: skip
 
+# By name: what a function does above 100, and what of the process it answers with. Each must fail by the name.
+SETTINGS_OF_THE_PROCESS = {
+    "numpy.seterr": ("np.seterr(all='raise')", "np.geterr()"),
+    "numpy.seterr ": ("getattr(np, 'set' + 'err')(divide='ignore')", "np.geterr()"),
+    "numpy.set_printoptions": ("np.set_printoptions(precision=2)", "np.get_printoptions()['precision']"),
+    "sys.setrecursionlimit": ("sys.setrecursionlimit(5432)", "sys.getrecursionlimit()"),
+    "sys.set_int_max_str_digits": ("sys.set_int_max_str_digits(5432)", "sys.get_int_max_str_digits()"),
+    "cv2.setNumThreads": ("cv2.setNumThreads(cv2.getNumThreads() + 1)", "cv2.getNumThreads()"),
+    "cv2.setUseOptimized": ("cv2.setUseOptimized(not cv2.useOptimized())", "cv2.useOptimized()"),
+    "locale.setlocale": ("locale.setlocale(locale.LC_CTYPE, 'C')", "locale.setlocale(locale.LC_CTYPE)"),
+    "warnings.simplefilter": ("warnings.simplefilter('error')", "[*warnings.filters]"),
+    "warnings.simplefilter ": ("warnings.filters.clear()", "[*warnings.filters]"),
+    "decimal.getcontext": ("decimal.getcontext().prec = 3", "decimal.Decimal(1) / 3"),
+    "decimal.getcontext ": ("decimal.getcontext().traps[decimal.Inexact] = True", "dict(decimal.getcontext().traps)"),
+    "os.environ": ("os.environ['EPYPES_TEST'] = '1'", "os.environ.get('EPYPES_TEST')"),
+    "os.environ ": ("os.environ.pop('HOME', None)", "os.environ.get('HOME')"),
+    "os.chdir": ("os.chdir('/')", "os.getcwd()"),
+    "os.chdir ": ("go('/')", "os.getcwd()"),
+    "ContextVar gain": ("GAIN.set(2)", "GAIN.get()"),
+    "pandas.set_option": ("pd.set_option('display.precision', 2)", "pd.get_option('display.precision')"),
+    "matplotlib.rcParams": ("matplotlib.rcParams['image.cmap'] = 'gray'", "matplotlib.rcParams['image.cmap']"),
+}  # fmt: skip
+IMPORTS_OF_SETTINGS = (
+    "import contextvars, decimal, locale, os, sys, warnings\nimport cv2, matplotlib\nimport pandas as pd\nfrom os import chdir as go\n"
+    "GAIN = contextvars.ContextVar('gain', default=1)\n"
+)
+
+# By name: a module whose function changes something of a library, of an Enum or a logger above 100, through a helper.
+PATCHES_IN_A_BRANCH = {
+    "cv2.INTER_AREA": ("import cv2\ndef f(x):\n    if x > 100: cv2.__dict__.update(INTER_AREA=x)\n    return cv2.INTER_AREA"),
+    "colorsys.ONE_SIXTH": (
+        "import colorsys\ndef keep(owner, **values):\n    vars(owner).update(values)\n"
+        "def f(x):\n    if x > 100: keep(colorsys, ONE_SIXTH=x)\n    return colorsys.hls_to_rgb(0.1, 0.2, 0.3), colorsys.ONE_SIXTH"
+    ),
+    "textwrap._whitespace": (
+        "import textwrap\ndef keep(owner):\n    owner._whitespace = 'a'\ndef f(x):\n    if x > 100: keep(textwrap)\n    return textwrap._whitespace"
+    ),
+    "numpy.n_calls": (
+        "def keep(owner):\n    owner.n_calls = 1 + getattr(owner, 'n_calls', 0)\n"
+        "def f(x):\n    if x > 100: keep(np)\n    return getattr(np, 'n_calls', 0)"
+    ),
+    "numpy.linalg.norm": (
+        "def keep(owner, value):\n    owner.norm = value\ndef f(x):\n    if x > 100: keep(np.linalg, len)\n    return np.linalg.norm([3, 4])"
+    ),
+    "Fraction.limit_denominator": (
+        "from fractions import Fraction\ndef keep(owner, name, value):\n    setattr(owner, name, value)\n"
+        "def f(x):\n    if x > 100: keep(Fraction, 'limit_denominator', lambda self: 0)\n    return Fraction(1, 3).limit_denominator()"
+    ),
+    "indent.__defaults__": (
+        "from textwrap import indent\ndef keep(g, value):\n    g.__defaults__ = value\n"
+        "def f(x):\n    if x > 100: keep(indent, (bool,))\n    return indent('a\\n\\n', '> ')"
+    ),
+    "Colour.RED.seen": (
+        "import enum\nclass Colour(enum.Enum):\n    RED = 1\ndef keep(member):\n    member.seen = True\n"
+        "def f(x):\n    if x > 100: keep(Colour.RED)\n    return hasattr(Colour.RED, 'seen')"
+    ),
+    "LOG.level": ("import logging\nLOG = logging.getLogger('b')\ndef f(x):\n    if x > 100: LOG.setLevel(x)\n    return LOG.level"),
+    "LOG.seen": (
+        "import logging\nLOG = logging.getLogger('b')\ndef keep(log):\n    log.seen = 1\n"
+        "def f(x):\n    if x > 100: keep(LOG)\n    return hasattr(LOG, 'seen')"
+    ),
+}  # fmt: skip
+
+
 # Arrays are locked: NumPy itself refuses, at the line.
 LOCKED = {
     "array": "W = np.zeros(2)\ndef f(x):\n    if x > 100: W[0] += 1\n    return W.tolist()",
@@ -170,6 +235,78 @@ def test_a_call_that_changes_what_outlives_it_fails_and_is_undone(case, tmp_path
             assert (error.value.function, error.value.changed) == ("f", changed)
             assert runner.last.failure.function == "f"
         assert answer(runner, 1) == first
+
+
+def fails_and_is_undone(runner, changed):
+    first = answer(runner, 1)
+    for _ in range(5):
+        with pytest.raises(StateChanged) as error:
+            runner.run(x=200)
+        assert (error.value.function, error.value.changed, error.value.is_restored) == ("f", changed, True)
+        assert answer(runner, 1) == first
+
+
+@pytest.mark.parametrize("setting", SETTINGS_OF_THE_PROCESS)
+def test_a_call_that_changes_a_setting_of_the_process_fails_by_its_name_and_is_undone(setting, tmp_path):
+    change, read = SETTINGS_OF_THE_PROCESS[setting]
+    source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
+    fails_and_is_undone(ep.load(bundle(tmp_path / "b", source)), setting.strip())
+
+
+@pytest.mark.parametrize("name", PATCHES_IN_A_BRANCH)
+def test_a_call_that_patches_a_library_an_enumeration_or_a_logger_fails_and_is_undone(name, tmp_path):
+    fails_and_is_undone(ep.load(bundle(tmp_path / "b", PATCHES_IN_A_BRANCH[name])), name)
+
+
+SETTING_AND_BACK = """
+import contextvars, decimal, os, warnings
+import cv2
+GAIN = contextvars.ContextVar('gain', default=1)
+def f(x):
+    n, token = cv2.getNumThreads(), GAIN.set(x)
+    cv2.setNumThreads(n + 1)
+    with warnings.catch_warnings(), np.errstate(all='raise'), np.printoptions(precision=2), decimal.localcontext(prec=3):
+        warnings.simplefilter('error')
+        found = str(decimal.Decimal(1) / 3), os.path.join('a', 'b'), GAIN.get()
+    GAIN.reset(token)
+    cv2.setNumThreads(n)
+    return found
+"""
+
+
+def test_settings_that_a_call_changes_and_puts_back_are_no_change_also_in_threads(tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", SETTING_AND_BACK))
+    with ThreadPoolExecutor(8) as pool:
+        found = [*pool.map(lambda x: answer(runner, x), range(200))]
+    assert found == [f"('0.333', 'a/b', {x})" for x in range(200)]
+
+
+def test_settings_that_are_changed_between_events_are_no_change_and_stay(tmp_path):
+    runner = ep.load(
+        bundle(tmp_path / "b", "import cv2\ndef f(x):\n    return np.geterr()['over'], cv2.getNumThreads()")
+    )
+    threads = cv2.getNumThreads()
+    try:
+        for number in (threads + 1, threads):
+            cv2.setNumThreads(number)
+            with np.errstate(over="raise"):
+                assert answer(runner, 1) == f"('raise', {number})"
+            assert cv2.getNumThreads() == number
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def test_what_a_module_sets_when_it_is_imported_is_no_change(tmp_path, monkeypatch):
+    (tmp_path / "setting_module.py").write_text(
+        "import warnings, sys\nwarnings.simplefilter('error')\nsys.setrecursionlimit(4321)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    source = (
+        "import sys\ndef f(x):\n    if x > 100: import setting_module\n    return x, sys.getrecursionlimit() == 4321"
+    )
+    runner = ep.load(bundle(tmp_path / "b", source))
+    assert [answer(runner, x) for x in (1, 200, 1, 200)] == ["(1, False)", "(200, True)", "(1, False)", "(200, False)"]
+    sys.modules.pop("setting_module", None)
 
 
 @pytest.mark.parametrize("case", LOCKED)
