@@ -3,7 +3,7 @@
 No answer may depend on an earlier event. Promotion refuses functions that plainly write to what outlives their call;
 syntax can't show all of it. So each function of a loaded bundle that refers to a mutable object is wrapped: after its
 call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged.
-Functions that refer only to constants, which are most, are not wrapped.
+For functions that refer only to constants, which are most, settings alone are compared, which takes some 2 us.
 
 Names and attributes are compared where some of the code can bind them, and locked arrays where some of it can unlock
 them; its instructions show that. To wrap every function and compare always takes 5 us per call: 27 % of an event of the
@@ -16,8 +16,13 @@ property has computed, a cache that is held elsewhere, and the attributes of a n
 count its calls. A function that reaches one of these never runs beside another one.
 
 A background model or a filter of OpenCV that outlives the call counts as changed. What a pipeline of the user's own
-class has in its attributes is not looked at. The global generators of ``random`` and ``numpy.random`` are not compared:
-a function may seed them for another one, and the replay finds draws without a seed.
+class has in its attributes is not looked at.
+
+How Python and libraries are set, and the variables of the context, are compared after each call of the user's
+functions. What a call sets in its context is gone with that; what else it has set is put back. What the code could
+patch in libraries is compared too: the attributes that its instructions store, or all of the modules and classes that
+it names where it stores by text, as ``vars`` and ``setattr`` do. The global random generators begin each event as they
+were when the bundle was loaded.
 
 Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.
@@ -33,6 +38,7 @@ import copy
 import dis
 import functools
 import itertools
+import random
 import sys
 import threading
 import types
@@ -59,7 +65,17 @@ from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.pipeline.node import wrap_calls
 from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
-from epypes.run.snapshot import Found, Record, Snapshot, array_record, as_dict, cached_properties, is_own, is_same
+from epypes.run.snapshot import (
+    Found,
+    Record,
+    Snapshot,
+    array_record,
+    as_dict,
+    cached_properties,
+    is_global_generator,
+    is_own,
+    is_same,
+)
 
 _CACHED: Final = type(functools.cache(len))
 # An attribute of an lru_cache: the one that takes its place.
@@ -89,6 +105,9 @@ _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
 _OF_A_LOGGER: Final = frozenset({"parent", "_cache"})
 # By these code binds names that its instructions don't say.
 _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
+# Code with one of these names may draw from a generator of the whole process, unless it makes its own.
+_DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
+_OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
 _SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
@@ -174,6 +193,8 @@ class CodeSnapshot(Snapshot):
         """Look into code too."""
         kind = type(value)
         home = value.__name__ if kind is types.ModuleType else getattr(value, "__module__", None)
+        if is_global_generator(getattr(value, "__self__", None)):
+            self._code.add("random")
         if isinstance(home, str):
             top = home.partition(".")[0]
             self._code |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
@@ -512,7 +533,7 @@ class MutableState:
     """
 
     def __init__(self, functions: Mapping[str, Callable[..., Any]], hyperparameters: Mapping[str, Any]) -> None:
-        self._lock, self._settings = _ReadersWriterLock(), _Settings()
+        self._lock, self._settings, self._generators = _ReadersWriterLock(), _Settings(), GlobalGenerators()
         self._shared = {
             f"hyperparameter {token}": value for token, value in hyperparameters.items() if _has_containers(value)
         }
@@ -564,7 +585,9 @@ class MutableState:
     def _guarded_call(
         self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
     ) -> Callable[..., Any]:
-        lock, referred, settings, has_resets = self._lock, self._referred, self._settings, bool(snapshot.resets)
+        lock, referred, settings = self._lock, self._referred, self._settings
+        draws = not snapshot.words.isdisjoint(_DRAWS) and snapshot.words.isdisjoint(_OWN_GENERATORS)
+        has_resets = draws or bool(snapshot.resets)
         attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
         @functools.wraps(function)
@@ -579,6 +602,8 @@ class MutableState:
                     lock.upgrade(ticket)
                     if snapshot.changed() is not None:  # by a call that waits to put it back
                         snapshot.restored()
+                    if draws:
+                        self._generators.begin(name)
                 result, error, changed = attempt(args, kwargs)
                 if changed is not None:
                     was_alone = is_exclusive or lock.upgrade(ticket)
@@ -697,6 +722,34 @@ class _Settings:
             with suppress(Exception):
                 one.write(sys.modules[one.module], known)
         return self.is_known()
+
+
+class GlobalGenerators:
+    """The random generators of the whole process, which begin each event as they were when the bundle was loaded.
+
+    They can't be compared, since a function may seed them for another one. An event begins on a thread when a function
+    is called there again.
+    """
+
+    # The replays of a proof turn it off, to find draws without a seed.
+    are_put_back = True
+
+    def __init__(self) -> None:
+        self._numpy = sys.modules.get("numpy.random")
+        self._first = random.getstate(), self._numpy.get_state() if self._numpy else None
+        self._local = threading.local()
+
+    def begin(self, name: str) -> None:
+        """Note that a function is called which may draw from them; put them back where an event begins."""
+        called = vars(self._local).setdefault("called", set())
+        if (name in called or not called) and self.are_put_back:
+            called.clear()
+            random.setstate(self._first[0])
+            if self._numpy is not None:
+                self._numpy.set_state(self._first[1])
+            if "cv2" in sys.modules:
+                sys.modules["cv2"].setRNGSeed(0)  # as OpenCV begins
+        called.add(name)
 
 
 # The names of variables of a context, and what sets them.

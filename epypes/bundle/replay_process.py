@@ -39,6 +39,7 @@ from epypes.bundle.manifest import (
     own_packages,
     recorded_environment,
 )
+from epypes.bundle.mutable_state import GlobalGenerators
 from epypes.bundle.replay import ReplayReport, record_again, replay
 from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
 from epypes.bundle.resolve import evaluated
@@ -135,6 +136,7 @@ def without_python() -> dict[str, str]:
 def main(arguments: Sequence[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
+    GlobalGenerators.are_put_back = False
     try:
         if "--record" in arguments:
             report = record_again(read_bundle(folder, compare=False))

@@ -258,6 +258,33 @@ def test_a_call_that_patches_a_library_an_enumeration_or_a_logger_fails_and_is_u
     fails_and_is_undone(ep.load(bundle(tmp_path / "b", PATCHES_IN_A_BRANCH[name])), name)
 
 
+@pytest.mark.parametrize(
+    ("seed", "draw"),
+    [
+        ("random.seed(x)", "random.random()"),
+        ("np.random.seed(x)", "np.random.rand()"),
+        ("cv2.setRNGSeed(x)", "cv2.randu(np.zeros(3), 0, 9).tolist()"),
+        ("seed(x)", "draw()"),
+    ],
+)
+def test_what_an_event_draws_depends_on_no_earlier_one_also_if_it_has_no_seed(seed, draw, tmp_path):
+    source = f"""
+from random import random as draw, seed
+import cv2
+def g(x):
+    if x < 100: {seed}
+    return x
+def f(x, z):
+    return {draw}
+func_dict, func_io = {{"g": g, "f": f}}, {{"g": ("x", "z"), "f": (("x", "z"), "y")}}
+"""
+    runner = ep.load(bundle(tmp_path / "b", source))
+    unseeded, seeded = answer(runner, 200), answer(runner, 1)
+    assert "Error" not in unseeded + seeded
+    assert unseeded != seeded
+    assert [answer(runner, x) for x in (2, 200, 200, 1, 3, 200, 1)][1:4] == [unseeded, unseeded, seeded]
+
+
 SETTING_AND_BACK = """
 import contextvars, decimal, os, warnings
 import cv2
