@@ -28,6 +28,8 @@ Attributes = Mapping[str, Mapping[str, str]]
 
 # Only where a function catches warnings, errors in their place change what it computes.
 WARNINGS: Final = "warnings.simplefilter"
+# What the name of a variable of the context follows.
+CONTEXT_VARIABLE: Final = "ContextVar "
 _ATOMS: Final = (int, float, complex, bool, str, bytes, type(None), type(...))
 # Longer descriptions are digests.
 _MOST_TEXT: Final = 60
@@ -84,6 +86,11 @@ def library_settings() -> dict[str, str]:
     return found
 
 
+def is_setting(name: str) -> bool:
+    """Whether this is the name of a setting or of a variable of the context."""
+    return name.startswith(CONTEXT_VARIABLE) or any(name == setting.name for setting in SETTINGS)
+
+
 def is_of_texts(setting: str) -> bool:
     """Whether a setting changes nothing but how values are written as text."""
     return setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
@@ -127,6 +134,10 @@ def _decimal_text(value: Any) -> dict[str, str]:
 
 
 _PARTS_OF_LOCALE: Final = "LC_NUMERIC", "LC_TIME", "LC_COLLATE", "LC_CTYPE"
+
+
+def _locale_reader(locale: Any) -> Callable[[], Any]:
+    return lambda: {part: locale.setlocale(getattr(locale, part)) for part in _PARTS_OF_LOCALE}
 
 
 def _set_locale(locale: Any, parts: Mapping[str, str]) -> None:
@@ -176,61 +187,36 @@ def _set_environment(os: Any, variables: Mapping[bytes, bytes]) -> None:
     os.environ.update({os.fsdecode(name): os.fsdecode(value) for name, value in variables.items()})
 
 
+def _of_functions(name: str, getter: str, words: str = "", texts: Any = None, *, by_keyword: bool = False) -> Setting:
+    """Return a setting that one function of a module reads and another one, which gives it its name, writes."""
+    module, _, setter = name.rpartition(".")
+
+    def write(module: Any, value: Any) -> None:
+        set_to = getattr(module, setter)
+        set_to(**value) if by_keyword else set_to(value)
+
+    return Setting(name, module, operator.attrgetter(getter), write, frozenset(words.split()), texts)
+
+
 SETTINGS: Final = (
-    Setting(
-        "sys.setrecursionlimit",
-        "sys",
-        lambda sys: sys.getrecursionlimit,
-        lambda sys, value: sys.setrecursionlimit(value),
-    ),
-    Setting(
-        "sys.set_int_max_str_digits",
-        "sys",
-        lambda sys: sys.get_int_max_str_digits,
-        lambda sys, value: sys.set_int_max_str_digits(value),
-    ),
+    _of_functions("sys.setrecursionlimit", "getrecursionlimit"),
+    _of_functions("sys.set_int_max_str_digits", "get_int_max_str_digits"),
     Setting(WARNINGS, "warnings", lambda warnings: lambda: warnings.filters, _set_filters, texts=_filters_text),
-    Setting("cv2.setNumThreads", "cv2", lambda cv2: cv2.getNumThreads, lambda cv2, value: cv2.setNumThreads(value)),
-    Setting(
-        "cv2.setUseOptimized",
-        "cv2",
-        lambda cv2: cv2.useOptimized,
-        lambda cv2, value: cv2.setUseOptimized(value),
-        texts=lambda value: {"cv2.setUseOptimized": f"{value}"},
-    ),
-    Setting(
-        "os.environ",
-        "os",
-        lambda os: lambda: os.environ._data,  # as bytes: to decode all variables takes 20 us
-        _set_environment,
-        frozenset({"os"}),
-    ),
-    Setting("os.chdir", "os", lambda os: os.getcwd, lambda os, value: os.chdir(value), frozenset({"os"})),
-    Setting(
-        "locale.setlocale",
-        "locale",
-        lambda locale: lambda: {part: locale.setlocale(getattr(locale, part)) for part in _PARTS_OF_LOCALE},
-        _set_locale,
-        frozenset({"locale"}),
-        _locale_text,
-    ),
+    _of_functions("cv2.setNumThreads", "getNumThreads"),
+    _of_functions("cv2.setUseOptimized", "useOptimized", texts=lambda is_on: {"cv2.setUseOptimized": f"{is_on}"}),
+    # As bytes: to decode all variables takes 20 us.
+    Setting("os.environ", "os", lambda os: lambda: os.environ._data, _set_environment, frozenset({"os"})),
+    _of_functions("os.chdir", "getcwd", "os"),
+    Setting("locale.setlocale", "locale", _locale_reader, _set_locale, frozenset({"locale"}), _locale_text),
     Setting("decimal.getcontext", "decimal", _decimal_reader, _set_decimal, frozenset({"decimal"}), _decimal_text),
     # From NumPy 2 on these are variables of the context, which are all compared.
-    Setting(
-        "numpy.seterr",
-        "numpy",
-        lambda numpy: numpy.geterr,
-        lambda numpy, value: numpy.seterr(**value),
-        frozenset({"seterr"}),
-        _errors_text,
-    ),
-    Setting(
+    _of_functions("numpy.seterr", "geterr", "seterr", _errors_text, by_keyword=True),
+    _of_functions(
         "numpy.set_printoptions",
-        "numpy",
-        lambda numpy: numpy.get_printoptions,
-        lambda numpy, value: numpy.set_printoptions(**value),
-        frozenset({"set_printoptions"}),
+        "get_printoptions",
+        "set_printoptions",
         lambda value: {"numpy.set_printoptions": f"{value}"},
+        by_keyword=True,
     ),
     Setting(
         "pandas.set_option",

@@ -49,7 +49,7 @@ from enum import Enum
 from logging import Logger
 from typing import Any, Final
 
-from epypes.bundle.libraries import OF_THE_PROCESS, SETTINGS, Setting
+from epypes.bundle.libraries import CONTEXT_VARIABLE, OF_THE_PROCESS, SETTINGS, Setting, is_setting
 from epypes.bundle.private_import import import_module, plain_name
 from epypes.bundle.references import (
     cells_of,
@@ -625,7 +625,7 @@ class MutableState:
                 if error is not None:
                     raise error
                 if changed is not None:
-                    raise StateChanged(name, changed, is_restored)
+                    raise StateChanged(name, changed, is_restored, is_setting=is_setting(changed))
                 return result
             finally:
                 del error, result
@@ -762,7 +762,7 @@ def _set_in(context: Context, now: Context) -> str | None:
         before, after = (each.get(variable, _NO_VALUE) for each in (now, context))
         # Python makes the context of decimal numbers when it is first asked for.
         if after is not before and not (variable.name == "decimal_context" and before is _NO_VALUE):
-            return _SET_BY.get(variable.name, f"ContextVar {variable.name}")
+            return _SET_BY.get(variable.name, f"{CONTEXT_VARIABLE}{variable.name}")
     return None
 
 

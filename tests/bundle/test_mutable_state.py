@@ -243,6 +243,19 @@ def fails_and_is_undone(runner, changed):
         with pytest.raises(StateChanged) as error:
             runner.run(x=200)
         assert (error.value.function, error.value.changed, error.value.is_restored) == ("f", changed, True)
+        has_set = (
+            "numpy.s",
+            "sys.",
+            "cv2.set",
+            "warnings.",
+            "os.",
+            "decimal.",
+            "ContextVar",
+            "pandas",
+            "matplotlib",
+            "locale",
+        )
+        assert ("set it back before it returns" in str(error.value)) == changed.startswith(has_set)
         assert answer(runner, 1) == first
 
 
