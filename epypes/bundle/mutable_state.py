@@ -133,6 +133,8 @@ class CodeSnapshot(Snapshot):
         What puts back or forgets, after each call, what a call may change without a failure.
     nodes
         The nodes and pipelines that were met, by id.
+    has_code
+        Whether code of the user was met.
     """
 
     def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
@@ -141,6 +143,7 @@ class CodeSnapshot(Snapshot):
         self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
         self._code: set[str] = set()  # its names and instructions
+        self.has_code = False
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
         # The modules, classes and functions of libraries that the code names.
@@ -270,6 +273,7 @@ class CodeSnapshot(Snapshot):
 
     def _note_instructions(self, code: types.CodeType) -> None:
         """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
+        self.has_code = True
         self._code.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
@@ -561,11 +565,10 @@ class MutableState:
         function = _checked(function)
         snapshot = CodeSnapshot({**self._shared, name: function}, self._compared)
         self._settings.add(snapshot.words)
-        is_code = type(function) in (types.FunctionType, functools.partial, _CACHED)
-        is_of_library = not isinstance(function, Node) and not is_own(str(getattr(function, "__module__", "")))
-        if is_of_library and not snapshot and not self._settings.is_set_by(function):
+        is_of_user = snapshot.has_code or bool(snapshot)
+        if not is_of_user and not self._settings.is_set_by(function):
             return function
-        if is_code and not (is_of_library and type(function) is types.FunctionType):
+        if is_of_user and type(function) in (types.FunctionType, functools.partial, _CACHED):
             # It stays what the module defines, so that it can be promoted again.
             setattr(function, WATCH, functools.partial(self._guarded_call, function=function, snapshot=snapshot))
             self._refer_to(snapshot.nodes)

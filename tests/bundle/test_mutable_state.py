@@ -167,6 +167,21 @@ IMPORTS_OF_SETTINGS = (
     "GAIN = contextvars.ContextVar('gain', default=1)\n"
 )
 
+# By name: a module whose function, which is not a plain one, changes a setting above 100.
+SETTERS = {
+    "partial": "def g(k, x):\n    if x > 100: np.seterr(all='raise')\n    return np.geterr()\nf = functools.partial(g, 3)",
+    "cache": "@functools.cache\ndef f(x):\n    if x > 100: np.seterr(all='raise')\n    return np.geterr()",
+    "vectorized": "f = np.vectorize(lambda x: np.seterr(all='raise' if x > 100 else None)['over'])",
+    "object": "class C:\n    def __call__(self, x):\n        if x > 100: np.seterr(all='raise')\n        return np.geterr()\nf = C()",
+    "node": (
+        "import epypes as ep\ndef g(x):\n    if x > 100: np.seterr(all='raise')\n    return np.geterr()\nf = ep.Node('f', g)"
+    ),
+    "function of a library": (
+        "def g(x): return 'raise' if x > 100 else None\n"
+        "func_dict, func_io = {'g': g, 'f': np.seterr}, {'g': ('x', 'z'), 'f': ('z', 'y')}"
+    ),
+}  # fmt: skip
+
 # By name: a module whose function changes something of a library, of an Enum or a logger above 100, through a helper.
 PATCHES_IN_A_BRANCH = {
     "cv2.INTER_AREA": ("import cv2\ndef f(x):\n    if x > 100: cv2.__dict__.update(INTER_AREA=x)\n    return cv2.INTER_AREA"),
@@ -264,6 +279,11 @@ def test_a_call_that_changes_a_setting_of_the_process_fails_by_its_name_and_is_u
     change, read = SETTINGS_OF_THE_PROCESS[setting]
     source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
     fails_and_is_undone(ep.load(bundle(tmp_path / "b", source)), setting.strip())
+
+
+@pytest.mark.parametrize("kind", SETTERS)
+def test_settings_are_compared_whatever_kind_of_function_changes_them(kind, tmp_path):
+    fails_and_is_undone(ep.load(bundle(tmp_path / "b", SETTERS[kind])), "numpy.seterr")
 
 
 @pytest.mark.parametrize("name", PATCHES_IN_A_BRANCH)
