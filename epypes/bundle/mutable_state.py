@@ -108,6 +108,8 @@ _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__
 # Code with one of these names may draw from a generator of the whole process, unless it makes its own.
 _DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
 _OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
+# Py_TPFLAGS_HEAPTYPE: a class with this flag is no static one of C, which takes no attributes.
+_MADE_BY_PYTHON: Final = 1 << 9
 _SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
@@ -329,7 +331,7 @@ class CodeSnapshot(Snapshot):
         waiting = [*self._of_libraries.values()] if names is None or names else []
         while waiting:
             prefix, owner = waiting.pop()
-            if prefix.partition(".")[0] not in OF_THE_PROCESS:
+            if _can_be_patched(owner, names) and prefix.partition(".")[0] not in OF_THE_PROCESS:
                 self.records.append(_LibraryBindings(prefix, owner, names))
             if isinstance(owner, types.ModuleType):
                 for name in self._code & vars(owner).keys():
@@ -424,6 +426,13 @@ class _LibraryBindings(_Bindings):
                 setattr(value, name, before[name])
             else:
                 delattr(value, name)
+
+
+def _can_be_patched(owner: Any, names: frozenset[str] | None) -> bool:
+    """Whether attributes with some names, all without, can be set of a library's module, class or function."""
+    if isinstance(owner, type):
+        return bool(owner.__flags__ & _MADE_BY_PYTHON)
+    return names is None or isinstance(owner, types.ModuleType) or not names.isdisjoint(_PARTS_OF_A_FUNCTION)
 
 
 def _is_of_library(value: Any) -> bool:
