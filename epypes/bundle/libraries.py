@@ -67,6 +67,9 @@ class Setting(NamedTuple):
     texts
         Returns a value as texts by name, which promotion compares with those of a fresh process; None where that has
         another value anyway.
+    is_quiet
+        Of two values, whether no function computes anything else with the other one, so that it is put back without a
+        failure: many notebooks set a number of threads or ignore a warning where they need it.
     """
 
     name: str
@@ -75,6 +78,7 @@ class Setting(NamedTuple):
     write: Callable[[Any, Any], object]
     words: frozenset[str] = frozenset()
     texts: Callable[[Any], dict[str, str]] | None = None
+    is_quiet: Callable[[Any, Any], bool] = lambda before, now: False
 
 
 def library_settings() -> dict[str, str]:
@@ -110,6 +114,14 @@ def _set_filters(warnings: Any, filters: Any) -> None:
 def _errors_text(errors: Mapping[str, str]) -> dict[str, str]:
     raising = {error: way for error, way in errors.items() if way not in ("ignore", "warn", "print", "log")}
     return {"numpy.seterr": f"{raising or 'no errors are raised'}"}
+
+
+def _raises_as(before: Mapping[str, str], now: Mapping[str, str]) -> bool:
+    return _errors_text(before) == _errors_text(now)
+
+
+def _print_text(options: Mapping[str, Any]) -> dict[str, str]:
+    return {"numpy.set_printoptions": f"{options}"}
 
 
 _PARTS_OF_DECIMAL: Final = "prec", "rounding", "Emin", "Emax", "capitals", "clamp"
@@ -187,7 +199,7 @@ def _set_environment(os: Any, variables: Mapping[bytes, bytes]) -> None:
     os.environ.update({os.fsdecode(name): os.fsdecode(value) for name, value in variables.items()})
 
 
-def _of_functions(name: str, getter: str, words: str = "", texts: Any = None, *, by_keyword: bool = False) -> Setting:
+def _of_functions(name: str, getter: str, words: str = "", by_keyword: bool = False, **more: Any) -> Setting:
     """Return a setting that one function of a module reads and another one, which gives it its name, writes."""
     module, _, setter = name.rpartition(".")
 
@@ -195,14 +207,25 @@ def _of_functions(name: str, getter: str, words: str = "", texts: Any = None, *,
         set_to = getattr(module, setter)
         set_to(**value) if by_keyword else set_to(value)
 
-    return Setting(name, module, operator.attrgetter(getter), write, frozenset(words.split()), texts)
+    return Setting(name, module, operator.attrgetter(getter), write, frozenset(words.split()), **more)
+
+
+def _is_quiet(before: Any, now: Any) -> bool:
+    return True
 
 
 SETTINGS: Final = (
-    _of_functions("sys.setrecursionlimit", "getrecursionlimit"),
+    _of_functions("sys.setrecursionlimit", "getrecursionlimit", is_quiet=_is_quiet),
     _of_functions("sys.set_int_max_str_digits", "get_int_max_str_digits"),
-    Setting(WARNINGS, "warnings", lambda warnings: lambda: warnings.filters, _set_filters, texts=_filters_text),
-    _of_functions("cv2.setNumThreads", "getNumThreads"),
+    Setting(
+        WARNINGS,
+        "warnings",
+        lambda warnings: lambda: warnings.filters,
+        _set_filters,
+        texts=_filters_text,
+        is_quiet=lambda before, now: all(action != "error" for action, *_ in (*before, *now)),
+    ),
+    _of_functions("cv2.setNumThreads", "getNumThreads", is_quiet=_is_quiet),
     _of_functions("cv2.setUseOptimized", "useOptimized", texts=lambda is_on: {"cv2.setUseOptimized": f"{is_on}"}),
     # As bytes: to decode all variables takes 20 us.
     Setting("os.environ", "os", lambda os: lambda: os.environ._data, _set_environment, frozenset({"os"})),
@@ -210,14 +233,8 @@ SETTINGS: Final = (
     Setting("locale.setlocale", "locale", _locale_reader, _set_locale, frozenset({"locale"}), _locale_text),
     Setting("decimal.getcontext", "decimal", _decimal_reader, _set_decimal, frozenset({"decimal"}), _decimal_text),
     # From NumPy 2 on these are variables of the context, which are all compared.
-    _of_functions("numpy.seterr", "geterr", "seterr", _errors_text, by_keyword=True),
-    _of_functions(
-        "numpy.set_printoptions",
-        "get_printoptions",
-        "set_printoptions",
-        lambda value: {"numpy.set_printoptions": f"{value}"},
-        by_keyword=True,
-    ),
+    _of_functions("numpy.seterr", "geterr", "seterr", by_keyword=True, texts=_errors_text, is_quiet=_raises_as),
+    _of_functions("numpy.set_printoptions", "get_printoptions", "set_printoptions", by_keyword=True, texts=_print_text),
     Setting(
         "pandas.set_option",
         "pandas",

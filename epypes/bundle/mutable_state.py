@@ -636,7 +636,7 @@ class MutableState:
             try:
                 if error is not None:
                     raise error
-                if changed is not None:
+                if changed:
                     raise StateChanged(name, changed, is_restored, is_setting=is_setting(changed))
                 return result
             finally:
@@ -712,25 +712,28 @@ class _Settings:
     def changed(self, context: Context, modules: int) -> str | None:
         """Return what a call has set, in its context or elsewhere; None if nothing is set otherwise than before.
 
-        What a module sets when it is imported is put back, and is no change: ``modules`` is how many there were.
+        It is "" if no function computes anything else with it. What a module sets when it is imported is put back, and
+        is no change: ``modules`` is how many there were.
         """
         now = copy_context()
         if self.is_known() and context == now:
             return None
-        name = _set_in(context, now) or next((one.name for one, _ in self._others()), None)
+        others = [*self._others()]
+        loud = (one.name for one, read, known in others if not one.is_quiet(known, read()))
+        name = _set_in(context, now) or next(loud, "" if others else None)
         if len(sys.modules) > modules:
             self.restored()
             return None
         return name
 
-    def _others(self) -> Iterator[tuple[Setting, Any]]:
+    def _others(self) -> Iterator[tuple[Setting, Callable[[], Any], Any]]:
         for one, (read, known) in zip(self._compared, self._known, strict=True):
             if read() != known:
-                yield one, known
+                yield one, read, known
 
     def restored(self) -> bool:
         """Put the settings back, and return whether that was possible."""
-        for one, known in self._others():
+        for one, _, known in self._others():
             with suppress(Exception):
                 one.write(sys.modules[one.module], known)
         return self.is_known()
@@ -773,12 +776,21 @@ def _set_in(context: Context, now: Context) -> str | None:
     for variable in {**context, **now}:
         before, after = (each.get(variable, _NO_VALUE) for each in (now, context))
         # Python makes the context of decimal numbers when it is first asked for.
-        if after is not before and not (variable.name == "decimal_context" and before is _NO_VALUE):
+        if after is not before and not (
+            (variable.name == "decimal_context" and before is _NO_VALUE)
+            or (variable.name == "numpy.ufunc.extobj" and _raises_as(context, now))
+        ):
             return _SET_BY.get(variable.name, f"{CONTEXT_VARIABLE}{variable.name}")
     return None
 
 
 _NO_VALUE: Final = object()
+
+
+def _raises_as(context: Context, now: Context) -> bool:
+    """Whether NumPy raises the same errors in two contexts."""
+    of_numpy, numpy = next(one for one in SETTINGS if one.name == "numpy.seterr"), sys.modules["numpy"]
+    return of_numpy.is_quiet(*(each.run(of_numpy.reader(numpy)) for each in (now, context)))
 
 
 class _ReadersWriterLock:

@@ -6,6 +6,7 @@ import queue
 import sys
 import textwrap
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -143,15 +144,13 @@ KEPT = {
 # By name: what a function does above 100, and what of the process it answers with. Each must fail by the name.
 SETTINGS_OF_THE_PROCESS = {
     "numpy.seterr": ("np.seterr(all='raise')", "np.geterr()"),
-    "numpy.seterr ": ("getattr(np, 'set' + 'err')(divide='ignore')", "np.geterr()"),
+    "numpy.seterr ": ("getattr(np, 'set' + 'err')(divide='raise')", "np.geterr()"),
     "numpy.set_printoptions": ("np.set_printoptions(precision=2)", "np.get_printoptions()['precision']"),
-    "sys.setrecursionlimit": ("sys.setrecursionlimit(5432)", "sys.getrecursionlimit()"),
     "sys.set_int_max_str_digits": ("sys.set_int_max_str_digits(5432)", "sys.get_int_max_str_digits()"),
-    "cv2.setNumThreads": ("cv2.setNumThreads(cv2.getNumThreads() + 1)", "cv2.getNumThreads()"),
     "cv2.setUseOptimized": ("cv2.setUseOptimized(not cv2.useOptimized())", "cv2.useOptimized()"),
     "locale.setlocale": ("locale.setlocale(locale.LC_CTYPE, 'C')", "locale.setlocale(locale.LC_CTYPE)"),
     "warnings.simplefilter": ("warnings.simplefilter('error')", "[*warnings.filters]"),
-    "warnings.simplefilter ": ("warnings.filters.clear()", "[*warnings.filters]"),
+    "warnings.simplefilter ": ("warnings.filters.insert(0, ('error', None, OSError, None, 0))", "[*warnings.filters]"),
     "decimal.getcontext": ("decimal.getcontext().prec = 3", "decimal.Decimal(1) / 3"),
     "decimal.getcontext ": ("decimal.getcontext().traps[decimal.Inexact] = True", "dict(decimal.getcontext().traps)"),
     "os.environ": ("os.environ['EPYPES_TEST'] = '1'", "os.environ.get('EPYPES_TEST')"),
@@ -162,6 +161,13 @@ SETTINGS_OF_THE_PROCESS = {
     "pandas.set_option": ("pd.set_option('display.precision', 2)", "pd.get_option('display.precision')"),
     "matplotlib.rcParams": ("matplotlib.rcParams['image.cmap'] = 'gray'", "matplotlib.rcParams['image.cmap']"),
 }  # fmt: skip
+# What no function computes anything else with: it is put back without a failure.
+QUIET_SETTINGS = {
+    "numpy.seterr": ("np.seterr(all='ignore')", "np.geterr()"),
+    "sys.setrecursionlimit": ("sys.setrecursionlimit(5432)", "sys.getrecursionlimit()"),
+    "cv2.setNumThreads": ("cv2.setNumThreads(cv2.getNumThreads() + 1)", "cv2.getNumThreads()"),
+    "warnings.simplefilter": ("warnings.simplefilter('ignore')", "[*warnings.filters]"),
+}
 IMPORTS_OF_SETTINGS = (
     "import contextvars, decimal, locale, os, sys, warnings\nimport cv2, matplotlib\nimport pandas as pd\nfrom os import chdir as go\n"
     "GAIN = contextvars.ContextVar('gain', default=1)\n"
@@ -279,6 +285,19 @@ def test_a_call_that_changes_a_setting_of_the_process_fails_by_its_name_and_is_u
     change, read = SETTINGS_OF_THE_PROCESS[setting]
     source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
     fails_and_is_undone(ep.load(bundle(tmp_path / "b", source)), setting.strip())
+
+
+@pytest.mark.parametrize("setting", QUIET_SETTINGS)
+def test_a_setting_that_changes_no_value_is_put_back_without_a_failure(setting, tmp_path):
+    change, read = QUIET_SETTINGS[setting]
+    source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
+    runner = ep.load(bundle(tmp_path / "b", source))
+    with warnings.catch_warnings():
+        warnings.resetwarnings()
+        first = answer(runner, 1)
+        for _ in range(5):
+            assert answer(runner, 200) not in (first, "StateChanged")
+            assert answer(runner, 1) == first
 
 
 @pytest.mark.parametrize("kind", SETTERS)
