@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import struct
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from skimage import data
 
 WIDTH, HEIGHT = 160, 120
 _BITS, _SIDE = 8, 16
 
 
+@cache
+def _photograph() -> Any:
+    return cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
+
+
 def picture(number: int) -> Any:
     """The frame of a number: a part of a photograph that moves, and the number in black and white squares."""
-    coffee = cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
-    image = np.ascontiguousarray(coffee[100 : 100 + HEIGHT, number % 200 : number % 200 + WIDTH])
+    image = _photograph()[100 : 100 + HEIGHT, number % 200 : number % 200 + WIDTH].copy()
     for bit in range(_BITS):
         image[:_SIDE, bit * _SIDE : (bit + 1) * _SIDE] = 255 * (number >> bit & 1)
     return image

@@ -54,11 +54,11 @@ IMPORTED = {
         "the hash seed (PYTHONHASHSEED)",
     ),
     "a class with an address": (
-        "class C:\n    K = id(1)\ndef use(x):\n    return C.K * 0",
+        "class D:\n    K = id(1)\ndef use(x):\n    return D.K * 0",
         "the process that computes it",
     ),
     "a default of a method that was read": (
-        "import os\nclass C:\n    def g(self, k=os.getpid()): return k\ndef use(x):\n    return C().g() * 0",
+        "import os\nclass E:\n    def g(self, k=os.getpid()): return k\ndef use(x):\n    return E().g() * 0",
         "the process that computes it",
     ),
     "an argument of a decorator that was read": (
@@ -67,20 +67,25 @@ IMPORTED = {
         "the process that computes it",
     ),
     "a decorator that reads the environment": (
-        "import functools, os\ndef d(g):\n    k = int(os.environ.get('GAIN', '2'))\n    @functools.wraps(g)\n    def w(x):\n        return g(x) * k * 0\n"
-        "    return w\n@d\ndef use(x):\n    return x.sum()",
+        "import functools, os\ndef e(g):\n    k = int(os.environ.get('GAIN', '2'))\n    @functools.wraps(g)\n    def w(x):\n        return g(x) * k * 0\n"
+        "    return w\n@e\ndef use(x):\n    return x.sum()",
         "the variables of the environment",
     ),
     "a class that reads the environment": (
-        "class C:\n    from os import environ as env\n    K = len(env.get('HOME', ''))\ndef use(x):\n    return C.K * 0",
+        "class F:\n    from os import environ as env\n    K = len(env.get('HOME', ''))\ndef use(x):\n    return F.K * 0",
         "the variables of the environment",
     ),
 }  # fmt: skip
 
 
-def refusal(source, to):
-    """Run a cell that defines ``use`` as often as a notebook does, and return why it is not promoted."""
-    cg = ep.CompGraph({"use": cell(source)["use"], "length": np.size}, {"use": ("x", "used"), "length": ("x", "size")})
+def reasons_against(sources, to):
+    """Run the cells that each define ``use`` as often as a notebook does, and return why they are not promoted.
+
+    Their functions are ``use_0``, ``use_1`` ..., which make the tokens ``used_0``, ``used_1`` ...
+    """
+    functions = {f"use_{number}": cell(source)["use"] for number, source in enumerate(sources)}
+    tokens = {name: ("x", name.replace("use", "used")) for name in functions}
+    cg = ep.CompGraph({**functions, "length": np.size}, {**tokens, "length": ("x", "size")})
     runner = ep.CompGraphRunner(cg, {})
     for _ in range(3):
         runner.run(x=X)
@@ -88,23 +93,27 @@ def refusal(source, to):
         ep.promote(runner, to)
     assert not to.exists()
     assert not [*to.parent.iterdir()]
-    return "\n".join(caught.value.reasons)
+    return caught.value.reasons
 
 
-@pytest.mark.parametrize("what", DEPENDS)
-def test_what_depends_on_a_condition_is_refused_with_token_and_condition(what, tmp_path):
-    source, condition = DEPENDS[what]
-    text = refusal(source, tmp_path / "bundle")
-    assert "token 'used': " in text
-    assert f"It depends on {condition}, something that is not a token." in text
-    assert "'size'" not in text
+def refusal(source, to):
+    return "\n".join(reasons_against([source], to))
 
 
-@pytest.mark.parametrize("what", IMPORTED)
-def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_shows_it(what, tmp_path):
-    source, condition = IMPORTED[what]
-    text = refusal(source, tmp_path / "bundle")
-    assert f"What function 'use' refers to is another one in another process. It depends on {condition}" in text
+def test_what_depends_on_a_condition_is_refused_with_token_and_condition(tmp_path):
+    reasons = reasons_against([source for source, _ in DEPENDS.values()], tmp_path / "bundle")
+    assert len(reasons) == len(DEPENDS)  # none of 'size'
+    for number, (reason, (_, condition)) in enumerate(zip(reasons, DEPENDS.values(), strict=True)):
+        assert f"token 'used_{number}': " in reason
+        assert f"It depends on {condition}, something that is not a token." in reason
+
+
+def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_shows_it(tmp_path):
+    reasons = reasons_against([source for source, _ in IMPORTED.values()], tmp_path / "bundle")
+    for number, (reason, (_, condition)) in enumerate(zip(reasons, IMPORTED.values(), strict=True)):
+        assert reason.startswith(
+            f"What function 'use_{number}' refers to is another one in another process. It depends on {condition}"
+        )
 
 
 @pytest.mark.parametrize(
@@ -117,8 +126,8 @@ def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_
 )
 def test_a_function_that_keeps_something_from_call_to_call_is_refused(source, tmp_path):
     text = refusal(source, tmp_path / "bundle")
-    assert "token 'used': " in text
-    assert "It depends on when, how often and in which order function 'use' is called" in text
+    assert "token 'used_0': " in text
+    assert "It depends on when, how often and in which order function 'use_0' is called" in text
 
 
 def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):
@@ -192,7 +201,7 @@ def test_lines_that_no_sample_runs_are_named(tmp_path):
 
 def test_a_function_that_counts_is_refused(tmp_path):
     text = refusal("import itertools\nN = itertools.count()\ndef use(x):\n    return next(N)", tmp_path / "bundle")
-    assert "'use'" in text
+    assert "'use_0'" in text
 
 
 def test_noise_that_the_number_of_threads_makes_is_tolerated_as_such(tmp_path):
