@@ -106,6 +106,12 @@ def _filters_text(filters: Any) -> dict[str, str]:
     return {WARNINGS: ", ".join(f"{kind.__name__} is an error" for kind in own)}
 
 
+def _filters_reader(warnings: Any) -> Callable[[], Any]:
+    """Return what reads the filters; not those that ``catch_warnings`` puts in their place, for all threads at once."""
+    filters = warnings.filters
+    return lambda: filters
+
+
 def _set_filters(warnings: Any, filters: Any) -> None:
     warnings.simplefilter("ignore", append=True)  # has Python forget what it has decided by the old ones
     warnings.filters[:] = filters
@@ -220,7 +226,7 @@ SETTINGS: Final = (
     Setting(
         WARNINGS,
         "warnings",
-        lambda warnings: lambda: warnings.filters,
+        _filters_reader,
         _set_filters,
         texts=_filters_text,
         is_quiet=lambda before, now: all(action != "error" for action, *_ in (*before, *now)),

@@ -101,8 +101,8 @@ _OF_PYTHON: Final = frozenset(
     | {"_value2member_map_", "__slotnames__"}
 )
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
-# Which logger is above one, and which levels are on, changes when others are made.
-_OF_A_LOGGER: Final = frozenset({"parent", "_cache"})
+# How a logger logs changes no value, and depends on other loggers.
+_OF_A_LOGGER: Final = frozenset(vars(Logger("")))
 # By these code binds names that its instructions don't say.
 _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
 # Code with one of these names may draw from a generator of the whole process, unless it makes its own.

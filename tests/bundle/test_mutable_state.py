@@ -217,7 +217,6 @@ PATCHES_IN_A_BRANCH = {
         "import enum\nclass Colour(enum.Enum):\n    RED = 1\ndef keep(member):\n    member.seen = True\n"
         "def f(x):\n    if x > 100: keep(Colour.RED)\n    return hasattr(Colour.RED, 'seen')"
     ),
-    "LOG.level": ("import logging\nLOG = logging.getLogger('b')\ndef f(x):\n    if x > 100: LOG.setLevel(x)\n    return LOG.level"),
     "LOG.seen": (
         "import logging\nLOG = logging.getLogger('b')\ndef keep(log):\n    log.seen = 1\n"
         "def f(x):\n    if x > 100: keep(LOG)\n    return hasattr(LOG, 'seen')"
@@ -291,9 +290,9 @@ def test_a_call_that_changes_a_setting_of_the_process_fails_by_its_name_and_is_u
 def test_a_setting_that_changes_no_value_is_put_back_without_a_failure(setting, tmp_path):
     change, read = QUIET_SETTINGS[setting]
     source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
-    runner = ep.load(bundle(tmp_path / "b", source))
     with warnings.catch_warnings():
         warnings.resetwarnings()
+        runner = ep.load(bundle(tmp_path / "b", source))
         first = answer(runner, 1)
         for _ in range(5):
             assert answer(runner, 200) not in (first, "StateChanged")
@@ -358,6 +357,33 @@ def test_settings_that_a_call_changes_and_puts_back_are_no_change_also_in_thread
     with ThreadPoolExecutor(8) as pool:
         found = [*pool.map(lambda x: answer(runner, x), range(200))]
     assert found == [f"('0.333', 'a/b', {x})" for x in range(200)]
+
+
+CATCHING = """
+import threading, warnings
+caught, ended = threading.Barrier(2), threading.Event()
+def f(x):
+    if x > 100:
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            caught.wait(60)
+            ended.wait(60)
+    return x
+def g(x):
+    caught.wait(60)
+    return x
+func_dict, func_io = {"f": f, "g": g}, {"f": ("x", "y"), "g": ("x", "z")}
+"""
+
+
+def test_a_call_that_catches_warnings_has_no_other_one_called_again(tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", CATCHING))
+    ended = runner.cg.functions["f"].__globals__["ended"]
+    with ThreadPoolExecutor(1) as pool:
+        catching = pool.submit(lambda: runner.run("y", x=200)["y"])
+        assert runner.run("z", x=1)["z"] == 1, "it ends before the other one, and is called once"
+        ended.set()
+        assert catching.result(60) == 200
 
 
 def test_settings_that_are_changed_between_events_are_no_change_and_stay(tmp_path):
@@ -438,6 +464,7 @@ CONSTANT = {
     "cache that is held in a tuple": "CACHES = (functools.cache(lambda n: [n]),)\n"
     "def f(x):\n    CACHES[0](3).append(x)\n    return len(CACHES[0](3))",
     "dispatch": "@functools.singledispatch\ndef g(x): return x\n@g.register\ndef _(x: int): return x + 1\ndef f(x):\n    return g(x)",
+    "logger": "import logging\nLOG = logging.getLogger('b')\ndef f(x):\n    LOG.setLevel(x)\n    LOG.warning('x')\n    return x",
     "enumeration": "import enum\nclass E(enum.Flag):\n    A = 1\n    B = 2\ndef f(x):\n    return (E.A | E.B).value, E(x % 4).value",
     "warning": "import warnings\nn = 0\ndef f(x):\n    global n\n    with warnings.catch_warnings(record=True):\n        warnings.warn('a')\n    return x + n",
 }  # fmt: skip
