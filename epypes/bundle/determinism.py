@@ -24,8 +24,9 @@ from typing import Final
 from epypes.bundle.adapters import ANSWER
 from epypes.bundle.compare import Difference, add_tolerances
 from epypes.bundle.file_access import named_here
-from epypes.bundle.libraries import WARNINGS, attributes_of, changed_attributes, is_of_texts, library_settings
+from epypes.bundle.libraries import attributes_of, changed_attributes
 from epypes.bundle.manifest import REQUIREMENTS, SAMPLES, SETTINGS, code_of, write_manifest
+from epypes.bundle.process_settings import WARNINGS, is_of_texts, library_settings
 from epypes.bundle.replay import ReplayReport
 from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated, without_python
 from epypes.bundle.settings import read_settings

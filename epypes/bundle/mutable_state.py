@@ -34,23 +34,22 @@ running: to wait for one of them could be to wait for its own caller.
 
 from __future__ import annotations
 
-import copy
 import dis
 import functools
 import itertools
-import random
 import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from contextvars import Context, ContextVar, copy_context
+from contextvars import ContextVar, copy_context
 from enum import Enum
 from logging import Logger
 from typing import Any, Final
 
-from epypes.bundle.libraries import CONTEXT_VARIABLE, OF_THE_PROCESS, SETTINGS, Setting, is_setting
+from epypes.bundle.libraries import OF_THE_PROCESS
 from epypes.bundle.private_import import import_module, plain_name
+from epypes.bundle.process_settings import GlobalGenerators, ProcessSettings, is_setting
 from epypes.bundle.references import (
     cells_of,
     defaults_of,
@@ -102,7 +101,7 @@ _OF_PYTHON: Final = frozenset(
 )
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
 # How a logger logs changes no value, and depends on other loggers.
-_OF_A_LOGGER: Final = frozenset(vars(Logger("")))
+_OF_A_LOGGER: Final = frozenset(vars(Logger("")))  # noqa: LOG001 - one that nobody uses
 # By these code binds names that its instructions don't say.
 _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
 # Code with one of these names may draw from a generator of the whole process, unless it makes its own.
@@ -546,7 +545,7 @@ class MutableState:
     """
 
     def __init__(self, functions: Mapping[str, Callable[..., Any]], hyperparameters: Mapping[str, Any]) -> None:
-        self._lock, self._settings, self._generators = _ReadersWriterLock(), _Settings(), GlobalGenerators()
+        self._lock, self._settings, self._generators = _ReadersWriterLock(), ProcessSettings(), GlobalGenerators()
         self._shared = {
             f"hyperparameter {token}": value for token, value in hyperparameters.items() if _has_containers(value)
         }
@@ -651,7 +650,7 @@ _Outcome = tuple[Any, BaseException | None, str | None]
 
 
 def _attempt(
-    function: Callable[..., Any], snapshot: CodeSnapshot | None, settings: _Settings, args: Any, kwargs: Any
+    function: Callable[..., Any], snapshot: CodeSnapshot | None, settings: ProcessSettings, args: Any, kwargs: Any
 ) -> _Outcome:
     """Call a function; return its result, what it has raised, and what it has changed that outlives the call."""
     # What the call sets in the context is gone with that.
@@ -669,128 +668,6 @@ def _attempt(
     finally:
         # The exception refers to this frame, which refers to the exception, and to the images of the call.
         del error, result
-
-
-class _Settings:
-    """How Python and libraries are set, and the context, as calls find them and leave them."""
-
-    def __init__(self) -> None:
-        self._compared: list[Setting] = []
-        # What reads each of them, and what it has read.
-        self._known: list[tuple[Callable[[], Any], Any]] = []
-        self.add(frozenset())
-
-    def add(self, words: frozenset[str]) -> None:
-        """Compare from now on what code with these names may set, and what is always compared."""
-        loaded = (one for one in SETTINGS if one.module in sys.modules)
-        self._compared = [one for one in loaded if one in self._compared or not one.words or one.words & words]
-        self._known = [(one.reader(sys.modules[one.module]), None) for one in self._compared]
-        self._known = self.now()
-
-    @staticmethod
-    def is_set_by(function: Any) -> bool:
-        """Whether a function of a library is one that sets something."""
-        name = getattr(function, "__name__", "")
-        return any(name == one.name.rpartition(".")[2] for one in SETTINGS)
-
-    def is_known(self) -> bool:
-        """Whether all settings are as they are known."""
-        for read, known in self._known:  # noqa: SIM110 - all() takes twice as long
-            if read() != known:
-                return False
-        return True
-
-    def now(self) -> list[tuple[Callable[[], Any], Any]]:
-        """Return the settings as they are now, for ``set_to``."""
-        return [(read, copy.copy(read())) for read, _ in self._known]
-
-    def set_to(self, known: list[tuple[Callable[[], Any], Any]]) -> None:
-        """Set all as they were, and know them so from now on."""
-        self._known = known
-        self.restored()
-
-    def changed(self, context: Context, modules: int) -> str | None:
-        """Return what a call has set, in its context or elsewhere; None if nothing is set otherwise than before.
-
-        It is "" if no function computes anything else with it. What a module sets when it is imported is put back, and
-        is no change: ``modules`` is how many there were.
-        """
-        now = copy_context()
-        if self.is_known() and context == now:
-            return None
-        others = [*self._others()]
-        loud = (one.name for one, read, known in others if not one.is_quiet(known, read()))
-        name = _set_in(context, now) or next(loud, "" if others else None)
-        if len(sys.modules) > modules:
-            self.restored()
-            return None
-        return name
-
-    def _others(self) -> Iterator[tuple[Setting, Callable[[], Any], Any]]:
-        for one, (read, known) in zip(self._compared, self._known, strict=True):
-            if read() != known:
-                yield one, read, known
-
-    def restored(self) -> bool:
-        """Put the settings back, and return whether that was possible."""
-        for one, _, known in self._others():
-            with suppress(Exception):
-                one.write(sys.modules[one.module], known)
-        return self.is_known()
-
-
-class GlobalGenerators:
-    """The random generators of the whole process, which begin each event as they were when the bundle was loaded.
-
-    They can't be compared, since a function may seed them for another one. An event begins on a thread when a function
-    is called there again.
-    """
-
-    # The replays of a proof turn it off, to find draws without a seed.
-    are_put_back = True
-
-    def __init__(self) -> None:
-        self._numpy = sys.modules.get("numpy.random")
-        self._first = random.getstate(), self._numpy.get_state() if self._numpy else None
-        self._local = threading.local()
-
-    def begin(self, name: str) -> None:
-        """Note that a function is called which may draw from them; put them back where an event begins."""
-        called = vars(self._local).setdefault("called", set())
-        if (name in called or not called) and self.are_put_back:
-            called.clear()
-            random.setstate(self._first[0])
-            if self._numpy is not None:
-                self._numpy.set_state(self._first[1])
-            if "cv2" in sys.modules:
-                sys.modules["cv2"].setRNGSeed(0)  # as OpenCV begins
-        called.add(name)
-
-
-# The names of variables of a context, and what sets them.
-_SET_BY: Final = {"numpy.ufunc.extobj": "numpy.seterr", "format_options": "numpy.set_printoptions"}
-
-
-def _set_in(context: Context, now: Context) -> str | None:
-    """Return which variable of a context has another value than now, or what sets it; None if there is none."""
-    for variable in {**context, **now}:
-        before, after = (each.get(variable, _NO_VALUE) for each in (now, context))
-        # Python makes the context of decimal numbers when it is first asked for.
-        if after is not before and not (
-            (variable.name == "decimal_context" and before is _NO_VALUE)
-            or (variable.name == "numpy.ufunc.extobj" and _raises_as(context, now))
-        ):
-            return _SET_BY.get(variable.name, f"{CONTEXT_VARIABLE}{variable.name}")
-    return None
-
-
-_NO_VALUE: Final = object()
-
-
-def _raises_as(context: Context, now: Context) -> bool:
-    """Whether NumPy raises the same errors in two contexts."""
-    of_numpy, numpy = next(one for one in SETTINGS if one.name == "numpy.seterr"), sys.modules["numpy"]
-    return of_numpy.is_quiet(*(each.run(of_numpy.reader(numpy)) for each in (now, context)))
 
 
 class _ReadersWriterLock:

@@ -27,7 +27,7 @@ from typing import Any, Final
 from epypes.bundle.compare import Difference, differences
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.fingerprint import Digester
-from epypes.bundle.libraries import library_attributes, library_settings
+from epypes.bundle.libraries import library_attributes
 from epypes.bundle.load import MODULES_OF_A_BUNDLE, WITH_DELAYS, Bundle, read_bundle
 from epypes.bundle.manifest import (
     REQUIREMENTS,
@@ -39,7 +39,7 @@ from epypes.bundle.manifest import (
     own_packages,
     recorded_environment,
 )
-from epypes.bundle.mutable_state import GlobalGenerators
+from epypes.bundle.process_settings import GlobalGenerators, library_settings
 from epypes.bundle.replay import ReplayReport, record_again, replay
 from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
 from epypes.bundle.resolve import evaluated
