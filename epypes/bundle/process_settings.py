@@ -289,7 +289,7 @@ class ProcessSettings:
         is no change: ``modules`` is how many there were.
         """
         now = copy_context()
-        if self.is_known() and context == now:
+        if self.is_known() and _is_same(context, now):
             return None
         others = [*self._others()]
         loud = (one.name for one, read, known in others if not one.is_quiet(known, read()))
@@ -358,6 +358,14 @@ def _set_in(context: Context, now: Context) -> str | None:
 
 
 _NO_VALUE: Final = object()
+
+
+def _is_same(context: Context, now: Context) -> bool:
+    """Whether the variables of two contexts have equal values, as far as these can be compared."""
+    try:
+        return context == now
+    except Exception:  # whatever values raise when they are compared, as arrays do
+        return False
 
 
 def _raises_alike(context: Context, now: Context) -> bool:

@@ -158,6 +158,7 @@ SETTINGS_OF_THE_PROCESS = {
     "os.chdir": ("os.chdir('/')", "os.getcwd()"),
     "os.chdir ": ("go('/')", "os.getcwd()"),
     "ContextVar gain": ("GAIN.set(2)", "GAIN.get()"),
+    "ContextVar kernel": ("KERNEL.set(np.ones(3))", "KERNEL.get()"),
     "pandas.set_option": ("pd.set_option('display.precision', 2)", "pd.get_option('display.precision')"),
     "matplotlib.rcParams": ("matplotlib.rcParams['image.cmap'] = 'gray'", "matplotlib.rcParams['image.cmap']"),
 }  # fmt: skip
@@ -170,7 +171,7 @@ QUIET_SETTINGS = {
 }
 IMPORTS_OF_SETTINGS = (
     "import contextvars, decimal, locale, os, sys, warnings\nimport cv2, matplotlib\nimport pandas as pd\nfrom os import chdir as go\n"
-    "GAIN = contextvars.ContextVar('gain', default=1)\n"
+    "GAIN, KERNEL = contextvars.ContextVar('gain', default=1), contextvars.ContextVar('kernel')\nKERNEL.set(np.zeros(3))\n"
 )
 
 # By name: a module whose function, which is not a plain one, changes a setting above 100.
