@@ -45,7 +45,7 @@ class Old(NamedTuple):
     def answer(self, owner: Any, name: str, error: type[Exception]) -> Any:
         """Return what the name stands for, with a warning at the line that uses it; or raise the error.
 
-        It is called by a ``__getattr__``, which that line has called.
+        It is called by a ``__getattr__`` or a descriptor, which that line has called.
         """
         if self.value is None:
             raise error(describe(name, self.new))

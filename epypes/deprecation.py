@@ -2,8 +2,7 @@
 
 Classes inherit `OldNames`, packages that had other names get ``__getattr__`` from `old_names`, and functions whose
 parameters were renamed are decorated with `takes_old_keywords`. What an old name answers is in the table of
-``epypes.compat``, which imports the upper rooms and is loaded when an object is first asked for an attribute that it
-has not.
+``epypes.compat``, which imports the upper rooms and is loaded when an object is first asked for an old name.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import functools
 import importlib
 import warnings
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,6 +31,22 @@ REMOVED: Final[Mapping[str, str]] = {
     "token_v_attr": "networkx.set_node_attributes(graph, ...)",
     "edge_attr": "networkx.set_edge_attributes(graph, ...)",
 }
+# Attributes by class; what they answer is in the table.
+OLD_MEMBERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "CompGraph": ("graph", "to_cg_with_nodes"),
+    "CompGraphRunner": (
+        "freeze_token", "frozen_tokens", "required_source_tokens", "to_networkx", "token_manager", "token_value",
+    ),
+    "TokenManager": (
+        "free", "free_source_tokens", "freeze_token", "frozen", "frozen_values", "get_values", "save_payload_value",
+        "to_networkx", "token_value",
+    ),
+    "Pipeline": ("cgraph", "get_attr", "modify_frozen_token", "set_attr", "token_value"),
+    "EventView": ("cgraph", "get_attr", "modify_frozen_token", "runner", "set_attr", "token_value"),
+    "EventLoop": ("is_alive", "set_exception_handler"),
+    "Endpoint": ("join",),
+    "PayloadError": ("missing_source_tokens",),
+}  # fmt: skip
 _OLD: Final = frozenset({*RENAMED, *REMOVED})
 _TABLE: Final = "epypes.compat"
 _PAGE: Final = "See docs/from_0_1.md."
@@ -68,20 +83,38 @@ def _renamed(given: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
+class _OldName:
+    """An attribute that a class had in EPypes 0.1; see docs/from_0_1.md."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, owner: Any, kind: type) -> Any:
+        old = None if owner is None else importlib.import_module(_TABLE).member(kind, self._name)
+        if old is None:
+            raise AttributeError(f"{kind.__name__!r} has no attribute {self._name!r}")
+        return old.answer(owner, f"{kind.__name__}.{self._name}", AttributeError)
+
+
 class OldNames:
-    """Answers the attributes that a class had in EPypes 0.1; they are not listed by ``dir()``."""
+    """Answers the attributes that a class had in EPypes 0.1; they are not listed by ``dir()`` of its objects.
+
+    There is no ``__getattr__``: with one, CPython does not specialize any look-up of an attribute, which made an event
+    take a fifth longer.
+    """
 
     __slots__ = ()
 
-    if not TYPE_CHECKING:  # a type checker would take any name for an attribute
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if cls.__module__.startswith("epypes."):
+            for name in OLD_MEMBERS.get(cls.__name__, ()):
+                setattr(cls, name, _OldName(name))
 
-        def __getattr__(self, name: str) -> Any:
-            if not name.startswith("_"):
-                old = importlib.import_module(_TABLE).member(type(self), name)
-                if old is not None:
-                    return old.answer(self, f"{type(self).__name__}.{name}", AttributeError)
-            # Raises what brought us here: also an AttributeError inside a property.
-            return object.__getattribute__(self, name)
+    def __dir__(self) -> list[str]:
+        """List the attributes that the class has today."""
+        old = {name for kind in type(self).__mro__ for name, value in vars(kind).items() if type(value) is _OldName}
+        return [name for name in super().__dir__() if name not in old]
 
 
 def old_names(module: str) -> Callable[[str], Any]:

@@ -1,4 +1,4 @@
-"""Which errors EPypes raises, and what each one carries.
+"""The errors that EPypes raises, and what each one carries.
 
 Everything an error's text mentions is an attribute of it::
 
@@ -69,6 +69,14 @@ class EpypesError(Exception):
     def __str__(self) -> str:
         # KeyError shows the repr of its argument; a sentence should be shown as it is.
         return str(self.args[0]) if self.args else type(self).__name__
+
+
+class _PathError(EpypesError):
+    """An error about what a path or a URL names; ``path`` is that."""
+
+    def __init__(self, path: object, text: str) -> None:
+        self.path = str(path)
+        super().__init__(text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,12 +304,8 @@ class LayoutUnavailable(EpypesError):
         )
 
 
-class ImageFileError(EpypesError, OSError):
+class ImageFileError(_PathError, OSError):
     """An image file that can't be read or written."""
-
-    def __init__(self, path: str, text: str) -> None:
-        self.path = path
-        super().__init__(text)
 
 
 class CameraUnavailable(EpypesError, OSError):
@@ -340,20 +344,12 @@ class BrokerError(AddressError):
     """A broker that can't be reached, or refuses what is asked of it."""
 
 
-class KeysError(EpypesError, ValueError):
+class KeysError(_PathError, ValueError):
     """Keys can't be made, read or used."""
 
-    def __init__(self, path: object, text: str) -> None:
-        self.path = str(path)
-        super().__init__(text)
 
-
-class RecordingError(EpypesError, OSError):
+class RecordingError(_PathError, OSError):
     """A file of recorded messages that can't be written, or is not what it should be."""
-
-    def __init__(self, path: object, text: str) -> None:
-        self.path = str(path)
-        super().__init__(text)
 
 
 class SettingsError(EpypesError):
@@ -365,12 +361,8 @@ class SettingsError(EpypesError):
         super().__init__(self.reasons[0] if len(self.reasons) == 1 else f"{path}:{listed}")
 
 
-class BundleError(EpypesError):
+class BundleError(_PathError):
     """A bundle that is not what it says it is."""
-
-    def __init__(self, path: object, text: str) -> None:
-        self.path = str(path)
-        super().__init__(text)
 
 
 class BundleChanged(BundleError):
@@ -404,12 +396,8 @@ class ExperimentError(EpypesError):
         super().__init__(text)
 
 
-class ServiceError(EpypesError):
+class ServiceError(_PathError):
     """A service that can't be started or can't be called."""
-
-    def __init__(self, path: object, text: str) -> None:
-        self.path = str(path)
-        super().__init__(text)
 
 
 class RemoteFailure(ServiceError):

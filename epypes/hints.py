@@ -1,4 +1,4 @@
-"""Which values may a hyperparameter take?
+"""The values that a hyperparameter may take.
 
 One vocabulary for panels, bundles and sweeps. A hint is given to the panel, or stands in the function's
 annotation: ``Annotated[int, Param(1, 31, odd=True)]``.
@@ -7,14 +7,11 @@ annotation: ``Annotated[int, Param(1, 31, odd=True)]``.
 from __future__ import annotations
 
 import enum
-import inspect
 import math
 import numbers
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
-
-from epypes.annotations import hints_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,29 +204,16 @@ def as_param(hint: Any) -> Param | Roi | None:
     return None
 
 
-def annotated_param(function: Callable[..., Any], position: int) -> Param | Roi | None:
-    """Read the hint in the annotation of a function's positional parameter, if there is one.
+def param_of(annotation: Any) -> Param | Roi | None:
+    """Read the hint in an annotation, if there is one.
 
     ``Annotated`` with a Param, a Roi or with the Ge, Gt, Le, Lt, Interval and MultipleOf of ``annotated_types``,
     ``Literal``, an ``Enum`` and ``bool`` are understood.
     """
-    hints = hints_of(function)
-    declared = getattr(function, "__signature__", None)
-    try:
-        if isinstance(declared, inspect.Signature):
-            name = tuple(declared.parameters)[position]
-        else:
-            name = tuple(function.__code__.co_varnames[: function.__code__.co_argcount])[position]
-    except (AttributeError, IndexError):
-        return None  # a C function: the value must do
-    return _from_annotation(hints.get(name))
-
-
-def _from_annotation(annotation: Any) -> Param | Roi | None:
     if get_origin(annotation) is Annotated:
         plain, *marks = get_args(annotation)
         found = next((mark for mark in marks if isinstance(mark, Param | Roi)), None)
-        return found or _from_marks(marks) or _from_annotation(plain)
+        return found or _from_marks(marks) or param_of(plain)
     if get_origin(annotation) is Literal:
         return Param(choices=get_args(annotation))
     if isinstance(annotation, type) and issubclass(annotation, enum.Enum):

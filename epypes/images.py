@@ -8,15 +8,10 @@ It is read without numpy: a value that is an array brings what is asked of it.
 from __future__ import annotations
 
 import difflib
-import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from types import FunctionType, MethodType
-from typing import Annotated, Any, Final, Literal, get_args, get_origin
-from weakref import WeakKeyDictionary
-
-from epypes.annotations import hints_of
+from typing import Any, Final, Literal
 
 Order = Literal["bgr", "rgb"]
 
@@ -216,105 +211,18 @@ def swapped(image: Any) -> Any:
     return copy
 
 
+def in_order(image: Any, order: Order) -> Any:
+    """Return an image of OpenCV's, which is BGR, in an order; it is copied only if it has to be changed."""
+    return swapped(image) if order == "rgb" and has_colours(image) else image
+
+
+# By input and by output token of a function, the mark of an image or None.
 Contracts = tuple[tuple[Image | None, ...], tuple[Image | None, ...]]
-# By function, whether its hints have a mark. Weak, so that a function of a notebook that was defined again can go.
-_MARKED: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
 
 
-def is_marked(function: Callable[..., Any]) -> bool:
-    """Whether a function's annotations have a mark."""
-    return bool(_marked_hints(function))
-
-
-def image_contracts(function: Callable[..., Any]) -> Contracts:
-    """Read the marks in a function's annotations: by positional parameter, and by output.
-
-    A return annotation ``tuple[A, B]`` says it of two outputs, any other of one. Nothing is said (``((), ())``) where
-    there is no mark, or where the annotations can't be resolved.
-    """
-    read = _read(function)
-    return _marks(*read) if read is not None else ((), ())
-
-
-def _marks(signature: inspect.Signature, hints: Mapping[str, Any]) -> Contracts:
-    positional = [
-        parameter.name
-        for parameter in signature.parameters.values()
-        if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-    ]
-    returned = hints.get("return")
-    several = get_args(returned) if _is_several(returned) else (returned,)
-    return tuple(_mark(hints.get(name)) for name in positional), tuple(map(_mark, several))
-
-
-def contracts_of(function: Callable[..., Any], inputs: int, outputs: int) -> Contracts:
-    """Read the marks of a function as it stands in a graph: one entry per input and per output token.
-
-    ``*args`` speak for every input that they take, ``tuple[A, ...]`` and ``list[A]`` for every output. A return
-    annotation of another number of values says nothing. Without any mark, the answer is ``((), ())``.
-    """
-    read = _read(function)
-    if read is None:
-        return (), ()
-    signature, hints = read
-    taken, made = _marks(signature, hints)
-    rest = [parameter.name for parameter in signature.parameters.values() if parameter.kind == parameter.VAR_POSITIONAL]
-    filler = _mark(hints.get(rest[0])) if rest else None
-    taken = (*taken, *(filler for _ in range(inputs - len(taken))))[:inputs]
-    returned = hints.get("return")
-    alike = get_args(returned)[:1] if _is_alike(returned) else ()
-    if alike:
-        made = (_mark(alike[0]),) * outputs
-    return taken, made if len(made) == outputs else (None,) * outputs
-
-
-def _read(function: Callable[..., Any]) -> tuple[inspect.Signature, Mapping[str, Any]] | None:
-    """Return signature and hints of a function that has a mark."""
-    hints = _marked_hints(function)
-    try:
-        return (inspect.signature(_unwrapped(function)), hints) if hints else None
-    except Exception:  # an object's own __signature__ may be anything
-        return None
-
-
-def _marked_hints(function: Callable[..., Any]) -> Mapping[str, Any]:
-    """Return the hints of a function that has a mark, else none."""
-    plain = _unwrapped(function)
-    is_declared = not isinstance(plain, type) and "__annotations__" in getattr(plain, "__dict__", ())
-    if not is_declared and not isinstance(plain, FunctionType | MethodType):
-        return {}
-    hints = hints_of(plain)
-    if not hints or not isinstance(plain, FunctionType):
-        return hints if _has_mark(hints) else {}
-    marked = _MARKED.get(plain)
-    if marked is None:
-        marked = _MARKED[plain] = _has_mark(hints)
-    return hints if marked else {}
-
-
-def _has_mark(hints: Mapping[str, Any]) -> bool:
-    return any(_mark(part) for hint in hints.values() for part in (hint, *get_args(hint)))
-
-
-def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what a decorated function, or a Node, stands for."""
-    try:
-        is_wrapper = not isinstance(function, MethodType) and hasattr(function, "__wrapped__")
-        return inspect.unwrap(function) if is_wrapper else function
-    except Exception:  # whatever an object's __getattr__ raises
-        return function
-
-
-def _mark(annotation: Any) -> Image | None:
-    if isinstance(annotation, Image):
-        return annotation
-    marks = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
-    return next((mark for mark in marks if isinstance(mark, Image)), None)
-
-
-def _is_several(annotation: Any) -> bool:
-    return get_origin(annotation) is tuple and Ellipsis not in get_args(annotation)
-
-
-def _is_alike(annotation: Any) -> bool:
-    return get_origin(annotation) is list or (get_origin(annotation) is tuple and Ellipsis in get_args(annotation))
+def mark_of(annotation: Any) -> Image | None:
+    """Return the mark that an annotation is or has, None without any."""
+    # Of Annotated; typing.get_origin() takes five times as long, and a graph may have 10,000 functions.
+    marks = getattr(annotation, "__metadata__", None)
+    found = (annotation, *marks) if isinstance(marks, tuple) else (annotation,)
+    return next((mark for mark in found if isinstance(mark, Image)), None)

@@ -5,9 +5,10 @@ Every package that EPypes imports, besides what the command line stands on, is i
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 from epypes.errors import MissingPackage
 
@@ -55,6 +56,27 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "uvicorn": ("uvicorn", "serve"),
     "zmq": ("pyzmq", "serve"),
 }
+
+
+class LazyModule:
+    """A package that is imported when one of its names is first used: it may be missing, or take long to load.
+
+    Raises
+    ------
+    MissingPackage
+        The package is not installed; raised where a name is used.
+    """
+
+    def __init__(self, package: str) -> None:
+        self._package = package
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # asked by those who look through a module, as doctest does
+            raise AttributeError(name)
+        with optional_import():
+            found = getattr(importlib.import_module(self._package), name)
+        setattr(self, name, found)
+        return found
 
 
 @contextmanager

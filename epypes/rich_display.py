@@ -47,6 +47,18 @@ def to_text(shown: Any) -> str:
     return _formatters().text(shown)
 
 
+class Displayed:
+    """What shows itself: as a table of text when it is printed, with its pictures in a notebook."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return to_text(self)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        return mimebundle(self)
+
+
 def _formatters() -> Formatters:
     if not _registered:
         importlib.import_module(_PROVIDER)

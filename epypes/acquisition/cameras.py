@@ -11,7 +11,7 @@ from functools import partial
 from numbers import Integral, Real
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, Protocol, cast, runtime_checkable
+from typing import Any, Final, Protocol, TypeVar, cast, runtime_checkable
 
 from epypes.acquisition.files import image_files, is_image_file, quiet_opencv, read_image
 from epypes.acquisition.frames import Frame, frame_image
@@ -26,6 +26,9 @@ LAST_DEVICE: Final = 2**31 - 1
 USUAL_FPS: Final = 10.0
 # Reads in a row that give nothing, after which a device is opened again. That takes a second, so not after the first.
 _MISSES: Final = 3
+
+
+T = TypeVar("T")
 
 
 @runtime_checkable
@@ -194,10 +197,10 @@ def _of_path(path: Path, fps: float | None, loop: bool) -> IterableCamera:
         return paced(SequenceCamera(lambda: map(read_image, files), loop), fps, USUAL_FPS)
     if not path.is_file() or is_image_file(path):
         return _still_camera(read_image(path), fps, loop)
-    unread = [Video(path)]
+    video = Video(path)
     # Opened anew for each round: the file may be another one by then.
-    start = SequenceCamera(lambda: (unread.pop() if unread else Video(path)).frames(), loop)
-    return paced(start, fps, unread[0].fps or USUAL_FPS)
+    opened = _again(video, lambda: Video(path))
+    return paced(SequenceCamera(lambda: opened().frames(), loop), fps, video.fps or USUAL_FPS)
 
 
 def _still_camera(image: Any, fps: float | None, loop: bool) -> IterableCamera:
@@ -215,8 +218,13 @@ def _of_function(source: Callable[[], Any], fps: float | None, loop: bool) -> It
             f"{name} returned {type(made).__name__!r}, which a camera can't be made of. "
             "Return an iterator of arrays or a cv2.VideoCapture; a generator function does the former."
         )
+    return paced(SequenceCamera(_again(made, source), loop), fps)
+
+
+def _again(made: T, make: Callable[[], T]) -> Callable[[], T]:
+    """Return a function that gives what is made already, and makes it again from its second call on."""
     first = [made]
-    return paced(SequenceCamera(lambda: first.pop() if first else source(), loop), fps)
+    return lambda: first.pop() if first else make()
 
 
 def _is_capture(source: Any) -> bool:
@@ -315,7 +323,8 @@ class PacedCamera:
         """Yield the frames of the camera, when they are due if that was asked for; `close` ends the wait."""
         self._closing.clear()
         due_s = -math.inf
-        for frame in _frames_of(self._camera):
+        # A user's own camera may have no loop.
+        for frame in self._camera if isinstance(self._camera, Iterable) else _frames_read(self._camera):
             if self._is_asked and self._closing.wait(min(due_s - monotonic(), threading.TIMEOUT_MAX)):
                 return
             due_s = next_due_s(due_s, self._period_s)
@@ -336,11 +345,6 @@ def paced(camera: Camera, fps: float | None, usual_fps: float = math.inf) -> Ite
     if kept_fps == math.inf:
         return cast(IterableCamera, camera)
     return PacedCamera(camera, kept_fps, is_asked=fps is not None)
-
-
-def _frames_of(camera: Camera) -> Iterator[Frame]:
-    """Return the frames of a camera, one of a user's own included."""
-    return iter(camera) if isinstance(camera, Iterable) else _frames_read(camera)
 
 
 def _frames_read(camera: Camera) -> Iterator[Frame]:
@@ -436,13 +440,11 @@ class LiveCamera:
 def _capture_camera(capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool) -> IterableCamera:
     import cv2
 
-    unread = [capture]
+    # A capture of ours is opened anew for each round, since not every format can be set back.
+    opened = _again(capture, opening or (lambda: capture))
 
     def start() -> Iterator[Any]:
-        if opening is None:
-            return _frames(capture, is_own=False, loop=loop)
-        # Opened anew for each round, since not every format can be set back.
-        return _frames(unread.pop() if unread else opening(), is_own=True, loop=loop)
+        return _frames(opened(), is_own=opening is not None, loop=loop)
 
     recorded_fps = float(capture.get(cv2.CAP_PROP_FPS))
     usual_fps = recorded_fps if 0 < recorded_fps <= 1_000 else USUAL_FPS

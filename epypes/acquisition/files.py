@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import ImageFileError
-from epypes.images import swapped
+from epypes.images import in_order
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 |
         if is_video_name(file):
             text = f"{str(path)!r} is a video, where one image is wanted. Take a frame of it: ep.video(path)[0]."
         raise ImageFileError(str(path), text)
-    return image if order == "bgr" else _in_other_order(image)  # type: ignore[no-any-return]
+    return in_order(image, order)  # type: ignore[no-any-return]
 
 
 def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr") -> None:
@@ -93,7 +93,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr")
         kind = f"{image.dtype} {image.shape}"
         raise ImageFileError(str(path), f"An array of {kind} can't be written as an image. Use a file ending in .npy.")
     try:
-        _, data = cv2.imencode(Path(path).suffix, shown if order == "bgr" else _in_other_order(shown))
+        _, data = cv2.imencode(Path(path).suffix, in_order(shown, order))
     except cv2.error as error:
         text = f"OpenCV can't write {str(path)!r}: no such format as {Path(path).suffix!r}. Use .png."
         raise ImageFileError(str(path), text) from error
@@ -101,10 +101,6 @@ def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr")
         Path(path).write_bytes(data.tobytes())
     except OSError as error:
         raise ImageFileError(str(path), f"{str(path)!r} can't be written: {error.strerror}.") from error
-
-
-def _in_other_order(image: Any) -> Any:
-    return swapped(image) if image.ndim == 3 and image.shape[2] in (3, 4) else image
 
 
 def image_files(path: Path) -> list[Path]:

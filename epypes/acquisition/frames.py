@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from epypes.errors import FrameUnavailable
 from epypes.graph import CompGraph, colour_order
-from epypes.images import Order, swapped
+from epypes.images import in_order
 
 Array = Any
 
@@ -48,14 +48,9 @@ class Frame:
 def with_images(payload: Mapping[str, Any], cg: CompGraph) -> dict[str, Any]:
     """Return a payload with images in place of frames, their colours in the orders of the graph's tokens."""
     return {
-        token: _image(value, colour_order(cg, token)) if isinstance(value, Frame) else value
+        token: in_order(value.image, colour_order(cg, token)) if isinstance(value, Frame) else value
         for token, value in payload.items()
     }
-
-
-def _image(frame: Frame, order: Order) -> Array:
-    has_colours = frame.image.ndim == 3 and frame.image.shape[2] in (3, 4)
-    return swapped(frame.image) if has_colours and order == "rgb" else frame.image
 
 
 class Ring:

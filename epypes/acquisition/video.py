@@ -6,12 +6,13 @@ frame is found by its time, never by a number of frames per second, so files of 
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -225,33 +226,21 @@ class UnreadableFrame(ImageFileError):
 # -- the index --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Index:
-    """What the packets of a video say.
+def _index_of(path: Path) -> tuple[tuple[int, ...], tuple[int, ...], Fraction, str]:
+    """Read the packets of a video.
 
-    Attributes
-    ----------
-    pts
-        The presentation time stamp of each frame that is shown and whole, rising.
-    keys
-        The time stamps of the key frames, rising; the first ones may not be shown.
-    unit_s
-        Seconds per time stamp, exact.
-    missing
-        What the file announces and does not have, as text; "" if it is whole.
+    Returns
+    -------
+    tuple
+        The presentation time stamp of each frame that is shown and whole, rising; the time stamps of the key frames,
+        rising, of which the first ones may not be shown; seconds per time stamp, exact; what the file announces and
+        does not have, as text, "" if it is whole.
     """
-
-    pts: tuple[int, ...]
-    keys: tuple[int, ...]
-    unit_s: Fraction
-    missing: str
-
-
-def _index_of(path: Path) -> _Index:
     with optional_import("vision"):
         import av
 
-    with _opened(path) as (container, stream):
+    container, stream = _open(path)
+    with closing(container):
         pts: set[int] = set()
         keys: set[int] = set()
         end_s, is_cut, packets = 0.0, False, 0
@@ -285,17 +274,7 @@ def _index_of(path: Path) -> _Index:
         lasts_s = end_s - (container.start_time or 0) / av.time_base
         is_cut = is_cut or stream.frames > packets or announced_s > lasts_s + max(_MISSING_S, announced_s / 100)
         has = f"{len(pts):,} of {stream.frames:,} frames" if stream.frames > len(pts) else f"{lasts_s:.1f} s of video"
-        return _Index(tuple(sorted(pts)), tuple(sorted(keys)), Fraction(stream.time_base or 0), has if is_cut else "")
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a video file in a block; the block gets its container and its stream."""
-    container, stream = _open(path)
-    try:
-        yield container, stream
-    finally:
-        container.close()
+        return tuple(sorted(pts)), tuple(sorted(keys)), Fraction(stream.time_base or 0), has if is_cut else ""
 
 
 def _open(path: Path) -> tuple[Any, Any]:
@@ -309,13 +288,8 @@ def _open(path: Path) -> tuple[Any, Any]:
     with optional_import("vision"):
         import av
 
-    name = str(path)
-    try:
-        is_folder, size = path.is_dir(), path.stat().st_size
-    except OSError as error:
-        text = f"Video '{name:.200}' can't be read: {error.strerror}. Check the path."
-        raise ImageFileError(name, text) from error
-    if is_folder:
+    name, (_, size, _) = str(path), _identity(path)
+    if path.is_dir():
         text = (
             f"{name!r} is a folder, no video. ep.map and ep.camera take a folder of images; of videos, give one file."
         )
@@ -345,20 +319,17 @@ def _open(path: Path) -> tuple[Any, Any]:
 
 def _unopened_text(path: Path) -> str:
     """Return why a file that FFmpeg does not open is no video."""
+    boxes: list[bytes] = []
     with path.open("rb") as file:
-        is_mp4, start = False, 0
-        while len(header := file.read(_BOX_HEADER)) == _BOX_HEADER:
-            length, kind = int.from_bytes(header[:4]), header[4:]
-            is_mp4 = is_mp4 or kind == b"ftyp"
+        while len(header := file.read(2 * _BOX_HEADER)) >= _BOX_HEADER and boxes[:1] in ([], [b"ftyp"]):
+            boxes.append(header[4:_BOX_HEADER])
+            length = int.from_bytes(header[:4])
             if length == 1:
-                length = int.from_bytes(file.read(_BOX_HEADER))
-            if kind == b"moov" or length < _BOX_HEADER or not is_mp4:
+                length = int.from_bytes(header[_BOX_HEADER:])
+            if length < _BOX_HEADER:
                 break
-            start += length
-            file.seek(start)
-        else:
-            kind = b""
-    if is_mp4 and kind != b"moov":
+            file.seek(length - len(header), os.SEEK_CUR)
+    if boxes[:1] == [b"ftyp"] and b"moov" not in boxes:
         return (
             f"{str(path)!r} was cut off: its index is missing, which an .mp4 has at its end, so no frame can be found. "
             "Record it again; an .avi or .mkv can be read as far as it goes."
@@ -389,8 +360,7 @@ class _VideoFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        index = _index_of(path)
-        self.pts, self._keys, self._unit_s = index.pts, index.keys, index.unit_s
+        self.pts, self._keys, self._unit_s, missing = _index_of(path)
         self._identity = _identity(path)
         self._lock = threading.Lock()
         self._container: Any = None
@@ -402,8 +372,8 @@ class _VideoFile:
         self._back = 0
         self._damaged: set[int] = set()
         self._kept: OrderedDict[int, Any] = OrderedDict()
-        if index.missing:
-            text = f"{str(path)!r} was cut off or is damaged: it has {index.missing}. These are used."
+        if missing:
+            text = f"{str(path)!r} was cut off or is damaged: it has {missing}. These are used."
             warn(text, UserWarning, stacklevel=3)
 
     def time_s(self, number: int) -> float:
@@ -553,7 +523,7 @@ def _identity(path: Path) -> _Identity:
     try:
         found = path.stat()
     except OSError as error:
-        text = f"Video {str(path)!r} can't be read: {error.strerror}. Check the path."
+        text = f"Video '{path!s:.200}' can't be read: {error.strerror}. Check the path."
         raise ImageFileError(str(path), text) from error
     return str(path.absolute()), found.st_size, found.st_mtime_ns
 

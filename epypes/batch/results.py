@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 
 from epypes.batch.items import Item
 from epypes.batch.thumbnails import Thumbnail, data_uri
-from epypes.display.previews.model import Look
+from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import float_text
 from epypes.display.text import content, duration_text, escape, fitted

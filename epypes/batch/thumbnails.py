@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from epypes.display.paint.vertices import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
+from epypes.display.previews import THUMBNAIL_PX, Look, Sketch
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.encoding import encode_small
-from epypes.display.previews.images import display_range, image_kind, is_image, sampled, sole_value
-from epypes.display.previews.model import THUMBNAIL_PX, Look, Sketch
+from epypes.display.previews.images import image_kind, is_image, sampled, sole_value
 from epypes.display.previews.preview import finished, looked_closer, sketch
 from epypes.display.previews.short import float_text
 from epypes.display.views.surroundings import RunSurroundings
@@ -57,7 +57,7 @@ def thumbnail_of(run: Run, token: str) -> Thumbnail | str:
     An image of one value is a text that states it, which a picture would not.
     """
     value = run.tokens.values[run.tokens.program.slots[token]]
-    around = RunSurroundings(run, token, lambda _token, image: display_range(image))
+    around = RunSurroundings(run, token, keeps_ranges=False)
     sketched = sketch(value, Look(colour_order(run.cg, token), around=around))
     return _sole_value_text(value, sketched) or _as_file(sketched)
 

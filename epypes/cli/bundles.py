@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from epypes.cli.options import PATH, bundle_argument, json_option
-from epypes.cli.terminal import print_table
+from epypes.cli.terminal import json_of, print_table
 from epypes.errors import BundleError, ReplayDiffers, ScaleError
 from epypes.wording import counted, ended
 
@@ -159,13 +159,11 @@ def check(bundle: Path, cases: Path, junit: Path | None, as_json: bool) -> None:
 
 
 def _to_json(outcome: CheckOutcome) -> dict[str, Any]:
-    value = outcome.value
     return {
         "case": outcome.case,
         "check": outcome.check,
         "token": outcome.token,
-        # JSON has no infinity.
-        "value": str(value) if value is not None and abs(value) == float("inf") else value,
+        "value": json_of(outcome.value),
         "threshold": outcome.threshold,
         "passed": outcome.passed,
         "reason": outcome.reason,

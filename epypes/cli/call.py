@@ -16,7 +16,7 @@ import click
 
 from epypes.cli.bundles import run_promotion
 from epypes.cli.options import PATH, allow_option, bundle_argument, keys_option, seconds_option
-from epypes.cli.terminal import print_table
+from epypes.cli.terminal import json_of, print_table
 from epypes.errors import ServiceError, UnknownName
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ _address_option: Final = functools.partial(
 )
 @seconds_option("--timeout", 10.0, "Longest wait for the answer", least=0.001)
 @click.option("--count", type=click.IntRange(1), default=1, help="Number of calls; the times are those of the fastest.")
-@click.option("--json", "as_json", is_flag=True, help="Print the times as JSON, in nanoseconds.")
+@click.option("--json", "as_json", is_flag=True, help="Print the answer as JSON, with the times in nanoseconds.")
 @keys_option
 @allow_option
 @_address_option("--sub")
@@ -67,30 +67,33 @@ def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as
     check_manifest(bundle)
     settings = read_settings(bundle / SETTINGS)
     inputs = _by_token(images, settings.inputs, "input")
-    wanted = _by_token(out, settings.outputs, "output")
+    files = _by_token(out, settings.outputs, "output")
     payload = {token: _read(text, settings.order(token)) for token, text in inputs.items()}
     coloured = [token for token, text in inputs.items() if has_colours(payload[token]) and Path(text).exists()]
     with Client(bundle, **options) as client:
-        answers = [client.call(payload) for _ in range(count)]
-    answer = min(answers, key=lambda answer: answer.round_trip_ns)
-    files = {token: file for token, file in wanted.items() if answer.tokens[token] is not Nothing}
-    pictures = (token for token, file in files.items() if Path(file).suffix != ".npy")
-    written = [token for token in pictures if has_colours(answer.tokens[token])]
-    for token, file in files.items():
+        answer = min((client.call(payload) for _ in range(count)), key=lambda answer: answer.round_trip_ns)
+    absent = [token for token in files if token not in answer.tokens]
+    if absent:  # an f_out of the bundle's own may answer anything
+        raise ServiceError(bundle, f"The answer has no {absent[0]!r}; it has: {', '.join(answer.tokens) or 'nothing'}.")
+    written = {token: file for token, file in files.items() if answer.tokens[token] is not Nothing}
+    for token, file in written.items():
         _write(file, answer.tokens[token], settings.order(token))
-    _warn_of_assumed(settings, [*coloured, *written])
+    pictures = (token for token, file in written.items() if Path(file).suffix != ".npy")
+    _warn_of_assumed(settings, [*coloured, *(token for token in pictures if has_colours(answer.tokens[token]))])
     if as_json:
-        click.echo(json.dumps(asdict(replace(answer, tokens={}))))
+        shown = {token: value for token, value in answer.tokens.items() if value is not Nothing}
+        tokens = {token: {"file": files[token]} if token in files else json_of(value) for token, value in shown.items()}
+        click.echo(json.dumps({**asdict(replace(answer, tokens={})), "tokens": tokens}))
         return
     for token in coloured:
         click.echo(f"{token} = {inputs[token]}, read as {settings.colour(token)}")
     for token, value in answer.tokens.items():
         if value is Nothing:
-            unwritten = f": {wanted[token]} is not written" if token in wanted else ""
+            unwritten = f": {files[token]} is not written" if token in files else ""
             click.echo(f"{token} = Nothing{unwritten}")
         elif token not in files:
             click.echo(f"{token} = {_text_of(value, settings.order(token))}")
-    _print_answer(": ".join([str(bundle), *filter(None, [" ".join(files.values())])]), answer)
+    _print_times(": ".join([str(bundle), *filter(None, [" ".join(written.values())])]), answer)
 
 
 def _text_of(value: Any, order: Order, level: int = 3) -> str:
@@ -128,13 +131,13 @@ def _warn_of_assumed(settings: Settings, tokens: Sequence[str]) -> None:
         click.echo(f'{text} If it is rgb, mark it in the notebook with ep.Image(order="rgb"), and promote.', err=True)
 
 
-def _print_answer(title: str, answer: Answer) -> None:
-    """Print the times of a service's answer as a table."""
+def _print_times(title: str, answer: Answer) -> None:
+    """Print the times of a service's answer as a table; an f_out of the bundle's own may leave some out."""
     from epypes.display.text import duration_text
 
     totals = {"graph overhead": answer.overhead_ns, "run in all": answer.total_ns, "round trip": answer.round_trip_ns}
     functions = [(f"function {name}", duration_text(time)) for name, time in answer.timings_ns.items()]
-    rows = [*functions, (), *((name, duration_text(time)) for name, time in totals.items())]
+    rows = [*functions, (), *((name, duration_text(time)) for name, time in totals.items() if time is not None)]
     print_table({"where": {}, "time": {"justify": "right"}}, rows, title)
 
 
@@ -146,20 +149,24 @@ def _by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[st
     UnknownName
         There is no such token.
     ServiceError
-        An input token is missing, or a file is not for one certain token.
+        An input token is missing, or has two values, or a file is not for one certain token.
     """
     found: dict[str, str] = {}
     for text in given:
         name, equals, file = text.partition("=")
-        if equals and name in tokens:
-            found[name] = file
-        elif equals and name.isidentifier() and not Path(text).exists():
-            raise UnknownName(f"{kind} token", name, tokens, "in this bundle")
-        elif len(tokens) == 1 and len(given) == 1:
-            found[tokens[0]] = text
-        else:
-            choices = ", ".join(f"{token}=FILE" for token in tokens)
-            raise ServiceError(text, f"Which {kind} is {text!r}? Write one of: {choices}")
+        if not equals or name not in tokens:
+            if equals and name.isidentifier() and not Path(text).exists():
+                raise UnknownName(f"{kind} token", name, tokens, "in this bundle")
+            if len(tokens) != 1:
+                choices = ", ".join(f"{token}=FILE" for token in tokens)
+                raise ServiceError(text, f"Which {kind} is {text!r}? Write one of: {choices}")
+            name, file = tokens[0], text
+        if name in found:
+            many = " Many images: ep.map(ep.load(bundle), files)." if kind == "input" else ""
+            raise ServiceError(
+                text, f"Two values for the {kind} {name!r}: {found[name]!r} and {file!r}. Give one.{many}"
+            )
+        found[name] = file
     missing = [token for token in tokens if token not in found] if kind == "input" else []
     if missing:
         raise ServiceError(missing, f"Missing {kind}: {', '.join(f'{token}=FILE' for token in missing)}")

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.display.layout.geometry import Direction
+from epypes.display.layout import Direction
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
 from epypes.display.paint.paper import save_on_paper
 from epypes.display.paint.svg import alt_text, paint_svg
 from epypes.display.paint.tables import Tabular, paint_table, paint_text, repr_text, summary_of, table_of, text_table
-from epypes.display.paint.times import paint_bars, report_times, summary_times, times_alt_text
+from epypes.display.paint.times import paint_bars, times_alt_text, times_of
 from epypes.display.previews.short import reason
 from epypes.display.text import MOST_THUMBNAILS, escape, size
 from epypes.display.views.graphview import GraphView, to_json
 from epypes.display.views.groups import function_count
-from epypes.display.views.view import Shown, view
+from epypes.display.views.view import view
 from epypes.errors import LayoutUnavailable
 from epypes.run import Plan, RunReport, TimingSummary
 from epypes.run.timing import Reports
@@ -32,10 +32,17 @@ def mimebundle(shown: Any) -> Forms:
 
     Never raises: what can't be painted is shown as text, with the reason and the way out.
     """
-    return _bundle(shown, lambda: _forms(shown), lambda: view(shown))
+    plain = repr_text(shown)
+    try:
+        return {"text/plain": plain, **_forms(shown)}
+    except LayoutUnavailable as error:
+        graph = shown.view if isinstance(shown, Figure) else view(shown)
+        return {"text/plain": f"{plain}\n{paint_text(graph)}\n{error}"}
+    except Exception as error:
+        return {"text/plain": f"{plain}\n(no picture: {reason(error)})"}
 
 
-def to_svg(shown: Shown) -> str:
+def to_svg(shown: Any) -> str:
     """Return the picture as the text of an SVG file.
 
     Raises
@@ -54,25 +61,16 @@ def to_text(shown: Tabular) -> str:
         return f"{repr_text(shown)}\n(no table: {reason(error)})"
 
 
-def _bundle(shown: Any, paint: Callable[[], Forms], look: Callable[[], GraphView]) -> Forms:
-    """Return a text and what is painted; where no Graphviz engine answers, the graph as text with the reason."""
-    plain = repr_text(shown)
-    try:
-        return {"text/plain": plain, **paint()}
-    except LayoutUnavailable as error:
-        return {"text/plain": f"{plain}\n{paint_text(look())}\n{error}"}
-    except Exception as error:
-        return {"text/plain": f"{plain}\n(no picture: {reason(error)})"}
-
-
 def _forms(shown: Any) -> Forms:
+    if isinstance(shown, Figure):
+        return _graph_forms(shown.view, shown.table)
     if isinstance(shown, Reports):
         shown = summary_of(shown)
     if isinstance(shown, str):
         return {"text/html": f"<p>{shown}</p>"}
     if not isinstance(shown, RunReport | TimingSummary):
         return _graph_forms(view(shown), _table_below(shown))
-    times = report_times(shown) if isinstance(shown, RunReport) else summary_times(shown)
+    times = times_of(shown)
     svg = paint_bars(times)
     figure = paint_figure(svg, times_alt_text(times), times.legend)
     return {"text/html": paint_page(figure, paint_table(table_of(shown))), "image/svg+xml": svg}
@@ -147,7 +145,7 @@ class Figure:
         return f"<Figure: {counted(function_count(self.view), 'function')}{groups}; {self.view.direction}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> Forms:
-        return _bundle(self, lambda: _graph_forms(self.view, self.table), lambda: self.view)
+        return mimebundle(self)
 
 
 def show(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -59,10 +59,21 @@ def written_length(text: str) -> int:
     )
 
 
+def shortened(text: str, characters: int) -> str:
+    """Return text of at most so many characters, with its blanks."""
+    return text if len(text) <= characters else text[: characters - 1] + "…"
+
+
 def cut(text: str, characters: int) -> str:
     """Return text on one line, of at most so many characters."""
     text = " ".join(text.split())
-    return text if len(text) <= characters else text[: characters - 1] + "…"
+    return text if len(text) <= characters else shortened(text, characters)
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Return the first of some names: ``"a, b and 3 more"``."""
+    more = f" and {len(names) - most} more" * (len(names) > most)
+    return ", ".join(names[:most]) + more
 
 
 def fitted(text: str, room: int) -> str:

@@ -1,4 +1,4 @@
-"""What is connected to what: computational graphs, pure and static."""
+"""Computational graphs, pure and static: what is connected to what."""
 
 from typing import TYPE_CHECKING
 
@@ -22,39 +22,15 @@ from epypes.graph.identity import inner_graph, is_redefined_inside, redefined, u
 from epypes.graph.placeholder import Placeholder, is_placeholder
 from epypes.graph.signature import outputs
 from epypes.graph.switch import Switch, as_switch, switch
-from epypes.graph.token_annotations import annotated_params, image_hint
+from epypes.graph.token_annotations import annotated_params
 from epypes.graph.validation import Delay
 
 __all__ = [
-    "ASSUMED",
-    "ColourOrder",
-    "CompGraph",
-    "Delay",
-    "Placeholder",
-    "Switch",
-    "annotated_params",
-    "as_switch",
-    "colour_order",
-    "delay",
-    "extend",
-    "group",
-    "image_hint",
-    "inner_graph",
-    "is_placeholder",
-    "is_redefined_inside",
-    "names_of",
-    "needed_for",
-    "outputs",
-    "redefined",
-    "rename",
-    "subgraph",
-    "suffix",
-    "switch",
-    "union",
-    "unwrapped",
-    "with_defaults",
-    "with_functions",
-]
+    "ASSUMED", "ColourOrder", "CompGraph", "Delay", "Placeholder", "Switch", "annotated_params", "as_switch",
+    "colour_order", "delay", "extend", "group", "inner_graph", "is_placeholder", "is_redefined_inside", "names_of",
+    "needed_for", "outputs", "redefined", "rename", "subgraph", "suffix", "switch", "union", "unwrapped",
+    "with_defaults", "with_functions",
+]  # fmt: skip
 
 if not TYPE_CHECKING:
     __getattr__ = old_names(__name__)

@@ -1,39 +1,84 @@
 """Colour use of a function: the order of colours in which it surely takes, passes on or makes images, read from source.
 
-The body is followed statement by statement, with what each local name surely is: a parameter's image, perhaps with
-red and blue exchanged, an image made in a certain order, or nothing known. What is done in one branch only, in a loop
-or in a nested function says nothing, unless the branch depends on the shape or dtype of an array alone.
+Names say it: the conversions of OpenCV and of scikit-image, and Matplotlib's imshow, which shows RGB. ``COLOR_BGR2RGB``
+and ``COLOR_RGB2BGR`` are one operation, and programs exchange the names: what they say is a hint, not sure. No library
+is imported.
+
+The body is followed statement by statement, with what each local name surely is. What is done in one branch only, in a
+loop or in a nested function says nothing, unless the branch depends on the shape or dtype of an array alone.
 """
 
 from __future__ import annotations
 
 import ast
+import re
+import sys
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from types import FunctionType, MethodType
-from typing import Any, Final
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Final
 from weakref import WeakKeyDictionary
 
-from epypes.graph.colour_names import (
-    PASSING_METHODS,
-    PLOT,
-    TELLING,
-    ColourCalls,
-    Passed,
-    Seen,
-    full_name,
-    library_name,
-    names_of_codes,
-    swapped,
-)
+from epypes.graph.identity import unwrapped
 from epypes.graph.source import Definition, argument_names, definition_of
 from epypes.images import Order
 
 # A user's function may call another, and that another.
 _DEEPEST: Final = 3
 _CACHE: Final = type(lru_cache(len))
-_ABOUT_SHAPE: Final = frozenset(("dtype", "ndim", "shape", "size"))
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+_SPACES: Final = _words("hed hsv lab luv rgbcie xyz ycbcr ydbdr yiq ypbpr yuv")
+_TO_RGB: Final = {f"{space}2rgb" for space in _SPACES} | {"label2rgb", "combine_stains"}
+_OF_RGB: Final = {f"rgb2{space}" for space in _SPACES} | {"rgb2gray", "separate_stains"}
+# A function whose code has none of these names tells nothing, unless one that it calls does.
+_TELLING: Final = _TO_RGB | _OF_RGB | {"cvtColor", "imread", "imshow"}
+_CONVERSION: Final = re.compile(r"cv2\.COLOR_([A-Za-z]+?)2([A-Za-z]\w*)")
+_CHANNELS: Final[Mapping[str, Order]] = {"BGR": "bgr", "BGRA": "bgr", "RGB": "rgb", "RGBA": "rgb"}
+# Of their first argument they return an image with the same channels.
+_PASSED_ON: Final[Mapping[str, frozenset[str]]] = {
+    "cv2": _words(
+        """GaussianBlur addWeighted bilateralFilter bitwise_and blur boxFilter convertScaleAbs copyMakeBorder dilate
+        edgePreservingFilter erode fastNlMeansDenoisingColored filter2D flip getRectSubPix medianBlur morphologyEx
+        pyrDown pyrUp remap resize rotate undistort warpAffine warpPerspective"""
+    ),
+    "numpy": _words("array asarray ascontiguousarray clip copy flipud fliplr float32 float64 rot90 uint8"),
+    "skimage": _words(
+        """img_as_float img_as_float32 img_as_float64 img_as_ubyte img_as_uint rescale resize rgba2rgb
+        rotate"""
+    ),
+    "matplotlib": frozenset(),
+}
+_PASSING_METHODS: Final = _words("astype clip copy")
+_ABOUT_SHAPE: Final = re.compile(r"dtype|ndim|shape|size|u?int\d*|float\d*|bool_?")
+_PASSED_CHANNELS: Final = (":", "0:", ":3", "0:3")
+
+
+@dataclass(frozen=True, slots=True)
+class TracedImage:
+    """The image of an input, or one that is made in a known order.
+
+    Attributes
+    ----------
+    place
+        The place of the input that brings it; None if it is made, as BGR.
+    is_swapped
+        Whether red and blue are exchanged.
+    """
+
+    place: int | None
+    is_swapped: bool = False
+
+
+# What an expression is: a TracedImage; a tuple of values; the dotted name of a library's module, function or constant,
+# "matplotlib" for any of its objects; a function of the user; None if nothing is known.
+Value = object
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +92,12 @@ class ColourUse:
     hinted
         Likewise, where only a name says it, as ``COLOR_RGB2BGR`` does.
     returned
-        What the value is.
-    parts
-        What its items are, if it is a tuple.
+        What the value is: a TracedImage, or a tuple of values; of anything else nothing is known.
     """
 
     taken: Mapping[int, Order] = field(default_factory=dict)
     hinted: Mapping[int, Order] = field(default_factory=dict)
-    returned: Seen = None
-    parts: tuple[Seen, ...] = ()
+    returned: Value = None
 
 
 _NOTHING: Final = ColourUse()
@@ -63,49 +105,33 @@ _NOTHING: Final = ColourUse()
 _READ: Final[WeakKeyDictionary[FunctionType, ColourUse]] = WeakKeyDictionary()
 
 
-def may_tell(function: object) -> bool:
+def opposite(order: Order) -> Order:
+    """Return the other order."""
+    return "rgb" if order == "bgr" else "bgr"
+
+
+def may_tell(function: object, depth: int = _DEEPEST) -> bool:
     """Whether the names in a function's code may say an order; cheap, and without its source."""
     try:
-        return _may_tell(_called(function), _DEEPEST)
+        plain = function if type(function) is FunctionType else unwrapped(function)
+        if not isinstance(plain, FunctionType):
+            return isinstance(function, partial)
+        names = plain.__code__.co_names
+        if plain.__name__ in _TELLING or not _TELLING.isdisjoint(names):
+            return True
+        called = (found for name in names if type(found := plain.__globals__.get(name)) is FunctionType)
+        return depth > 1 and any(each is not plain and may_tell(each, depth - 1) for each in called)
     except Exception:  # whatever an object's __getattr__ raises
         return False
 
 
-def _may_tell(function: object, depth: int) -> bool:
-    if type(function) is not FunctionType:
-        return isinstance(function, partial) or (isinstance(function, MethodType) and may_tell(function.__func__))
-    names = function.__code__.co_names
-    if not names or not depth:
-        return False
-    if not TELLING.isdisjoint(names) or function.__name__ in TELLING:
-        return True
-    around = function.__globals__
-    called = (around[name] for name in names if type(around.get(name)) is FunctionType)
-    return any(each is not function and _may_tell(each, depth - 1) for each in called)
-
-
-def colour_use(function: object) -> ColourUse:
-    """Return what a function surely does with orders of colours; never raises."""
+def colour_use(function: object, inputs: int) -> ColourUse:
+    """Return what a function with so many inputs surely does with orders of colours; never raises."""
     try:
-        return _use_of(function, _DEEPEST)
+        calls = _Calls(_DEEPEST + 1)
+        return calls.use(calls.call(_value_of(function), [TracedImage(place) for place in range(inputs)], {}))
     except Exception:  # names of a user's function may mean any odd objects
         return _NOTHING
-
-
-def _use_of(function: object, depth: int) -> ColourUse:
-    plain = _called(function)
-    if isinstance(plain, MethodType):
-        return _shifted(_use_of(plain.__func__, depth))
-    if isinstance(plain, partial):
-        return _use_of_partial(plain, depth)
-    library, name = library_name(full_name(plain))
-    if library == "skimage" or not isinstance(plain, FunctionType):
-        return _use_of_library(library, name)
-    known = _READ.get(plain)
-    if known is None and depth:
-        _READ[plain] = _NOTHING  # for a function that calls itself
-        known = _READ[plain] = _read(plain, depth)
-    return known or _NOTHING
 
 
 def _called(function: object) -> object:
@@ -119,309 +145,323 @@ def _called(function: object) -> object:
     return function
 
 
-def _shifted(use: ColourUse) -> ColourUse:
-    """Return the use of a method, whose first parameter is bound."""
-
-    def shift(seen: Seen) -> Seen:
-        if not isinstance(seen, Passed):
-            return seen
-        return seen._replace(place=seen.place - 1) if seen.place else None
-
-    return ColourUse(
-        {place - 1: order for place, order in use.taken.items() if place},
-        {place - 1: order for place, order in use.hinted.items() if place},
-        shift(use.returned),
-        tuple(map(shift, use.parts)),
-    )
+def _value_of(found: object, written: str = "") -> Value:
+    """Return what an object is, which stands under a name in the source: its dotted name, if it is of a library."""
+    found = _called(found)
+    if isinstance(found, ModuleType):
+        return found.__name__
+    name = getattr(found, "__name__", written)
+    if isinstance(found, BuiltinFunctionType | int) and getattr(sys.modules.get("cv2"), name, None) == found:
+        return f"cv2.{name}"
+    if isinstance(found, FunctionType | BuiltinFunctionType | type):
+        library = str(found.__module__).partition(".")[0]
+        return f"{library}.{name}" if library in _PASSED_ON else found
+    return found if isinstance(found, MethodType | partial) else None
 
 
-def _use_of_partial(function: partial[Any], depth: int) -> ColourUse:
-    """Return the use of ``partial(cv2.cvtColor, code=...)`` or of a function with bound keywords."""
-    if function.args:
-        return _NOTHING
-    if full_name(function.func) != "cv2.cvtColor":
-        return _use_of(function.func, depth)
-    names = names_of_codes().get(function.keywords.get("code", -1), ())
-    body = ColourCalls({}, ())
-    returned = {body.convert(Passed(0), name) for name in names}
-    return ColourUse(body.agreed(body.taken), {}, returned.pop() if len(returned) == 1 else None)
+def _use_of(function: FunctionType, depth: int) -> ColourUse:
+    known = _READ.get(function)
+    if known is None and depth:
+        known = _READ[function] = _NOTHING  # for a function that calls itself
+        node = definition_of(function)
+        if node is not None and not isinstance(node, ast.AsyncFunctionDef):
+            known = _READ[function] = _FunctionBody(function, node, depth).read(node)
+    return known or _NOTHING
 
 
-def _use_of_library(library: str, name: str) -> ColourUse:
-    body = ColourCalls({}, ())
-    returned = body.library_call(library, name, [Passed(0)])
-    return ColourUse(body.agreed(body.taken), {}, returned)
+def _swapped(value: Value) -> Value:
+    return replace(value, is_swapped=not value.is_swapped) if isinstance(value, TracedImage) else None
 
 
-def _read(function: FunctionType, depth: int) -> ColourUse:
-    node = definition_of(function)
-    if node is None or isinstance(node, ast.AsyncFunctionDef):
-        return _NOTHING
-    body = _FunctionBody(function, node, depth)
-    return ColourUse(body.agreed(body.taken), body.agreed(body.hinted), *body.value_returned())
+def _with_inputs(value: Value, given: Mapping[int, Value]) -> Value:
+    """Return what a function returns, which was given these values."""
+    if isinstance(value, tuple):
+        return tuple(_with_inputs(part, given) for part in value)
+    if not isinstance(value, TracedImage) or value.place is None:
+        return value
+    image = given.get(value.place)
+    return _swapped(image) if value.is_swapped else image
+
+
+class _Calls:
+    """The orders that calls show.
+
+    Parameters
+    ----------
+    depth
+        How deep calls are followed into functions of the user.
+    """
+
+    def __init__(self, depth: int) -> None:
+        self._depth = depth
+        self._taken: defaultdict[int, set[Order]] = defaultdict(set)
+        self._hinted: defaultdict[int, set[Order]] = defaultdict(set)
+
+    def use(self, returned: Value) -> ColourUse:
+        """Return the orders of the inputs of which one is known: a function that takes both knows what it does."""
+        taken, hinted = (
+            {place: next(iter(orders)) for place, orders in found.items() if len(orders) == 1}
+            for found in (self._taken, self._hinted)
+        )
+        return ColourUse(taken, hinted, returned)
+
+    def call(self, function: Value, arguments: Sequence[Value], keywords: Mapping[str, Value]) -> Value:
+        """Note what a call takes, and return what it makes."""
+        match function:
+            case str():
+                return self._call_library(function, arguments, keywords)
+            case MethodType():
+                return self.call(_value_of(function.__func__), [None, *arguments], keywords)
+            case partial(args=()):
+                bound = {name: value if type(value) is int else None for name, value in function.keywords.items()}
+                return self.call(_value_of(function.func), arguments, {**bound, **keywords})
+            case FunctionType():
+                use, code = _use_of(function, self._depth - 1), function.__code__
+                places = {name: place for place, name in enumerate(code.co_varnames[: code.co_argcount])}
+                given = dict(enumerate(arguments)) | {places[key]: keywords[key] for key in keywords if key in places}
+                for orders, is_hint in ((use.taken, False), (use.hinted, True)):
+                    for place, order in orders.items():
+                        self._take(given.get(place), order, is_hint=is_hint)
+                return _with_inputs(use.returned, given)
+        return None
+
+    def _call_library(self, full_name: str, arguments: Sequence[Value], keywords: Mapping[str, Value]) -> Value:
+        library, name = full_name.partition(".")[0], full_name.rpartition(".")[2]
+        named = (keywords[key] for key in ("src", "image", "X") if key in keywords)
+        image = arguments[0] if arguments else next(named, None)
+        if full_name == "cv2.cvtColor":
+            return self._convert(image, arguments[1] if len(arguments) > 1 else keywords.get("code"))
+        if full_name == "cv2.imread" and len(arguments) == 1 and not keywords:
+            return TracedImage(None)
+        if name in _PASSED_ON.get(library, ()):
+            return image if isinstance(image, TracedImage) else None
+        if library == "skimage" and "channel_axis" not in keywords:
+            if name in _OF_RGB:
+                self._take(image, "rgb")
+            return TracedImage(None, is_swapped=True) if name in _TO_RGB else None
+        if library == "matplotlib":
+            if name == "imshow" and len(arguments) < 2 and "cmap" not in keywords:
+                self._take(image, "rgb")
+            return library
+        return None
+
+    def _convert(self, image: Value, code: Value) -> Value:
+        """Note what a conversion of OpenCV takes, and return what it makes."""
+        codes: Iterable[str] = [code] if isinstance(code, str) else []
+        if type(code) is int:  # one number may have several names
+            codes = [f"cv2.{name}" for name, number in vars(sys.modules["cv2"]).items() if number is code]
+        made = {self._convert_by_name(image, *parts.groups()) for parts in map(_CONVERSION.fullmatch, codes) if parts}
+        return made.pop() if len(made) == 1 else None
+
+    def _convert_by_name(self, image: Value, of: str, to: str) -> Value:
+        before, after = _CHANNELS.get(of), _CHANNELS.get(to.partition("_")[0])
+        if before is not None:
+            self._take(image, before, is_hint=after is not None)
+            return None if after is None else _swapped(image) if before != after else image
+        # OpenCV calls the patterns of sensors otherwise than their makers.
+        return None if after is None or of == "GRAY" or of.startswith("Bayer") else TracedImage(None, after == "rgb")
+
+    def _take(self, image: Value, order: Order, *, is_hint: bool = False) -> None:
+        if isinstance(image, TracedImage) and image.place is not None:
+            orders = self._hinted if is_hint else self._taken
+            orders[image.place].add(opposite(order) if image.is_swapped else order)
 
 
 # -- bodies -----------------------------------------------------------------------------------------------------------
 
 
-class _FunctionBody(ColourCalls):
-    """The body of a Python function."""
+class _FunctionBody(_Calls):
+    """The body of a Python function, with what local names are."""
 
     def __init__(self, function: FunctionType, node: Definition, depth: int) -> None:
-        code = function.__code__
-        positional = argument_names(node)[: code.co_argcount]
-        names: dict[str, Seen] = {name: Passed(place) for place, name in enumerate(positional)}
-        super().__init__(names, range(len(positional)))
-        self._code, self._depth, self._globals = code, depth, function.__globals__
+        super().__init__(depth)
+        code = self._code = function.__code__
+        self._globals = function.__globals__
         self._closure = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
-        self._imported: dict[str, str] = {}
+        inputs = argument_names(node)[: code.co_argcount]
+        self._names: dict[str, Value] = {name: TracedImage(place) for place, name in enumerate(inputs)}
         # Nothing is written into the arrays of inputs, which are read-only.
-        self._untouched = set(positional) - _stored(node)
-        self._returned: list[tuple[Seen, tuple[Seen, ...]]] = []
-        # Whether every call executes the statement that is looked at.
-        self._is_sure = True
+        self._untouched = set(inputs) - _stored(node)
+        self._returned: set[Value] = set()
+
+    def read(self, node: Definition) -> ColourUse:
         if isinstance(node, ast.Lambda):
-            self._returned.append(self._seen_with_parts(node.body))
+            self._returned.add(self._value(node.body))
         else:
             self._follow(node.body)
+        return self.use(self._returned.pop() if len(self._returned) == 1 else None)
 
-    def value_returned(self) -> tuple[Seen, tuple[Seen, ...]]:
-        """Return what the value and its items are, the same at every return."""
-        found = set(self._returned)
-        return found.pop() if len(found) == 1 and self._is_sure else (None, ())
+    # -- expressions ----------------------------------------------------------------------------------------------
 
-    def _object(self, expression: ast.expr) -> Any:
-        """Return the object that a name outside of the function has; None for any other expression."""
-        code = self._code
-        if not isinstance(expression, ast.Name) or expression.id in (*code.co_varnames, *code.co_cellvars):
-            return None
-        if expression.id in self._closure:
-            return self._closure[expression.id].cell_contents
-        return self._globals.get(expression.id)
-
-    def _full_name(self, expression: ast.expr) -> str:
-        if isinstance(expression, ast.Name):
-            found = self._imported.get(expression.id)
-            return full_name(self._object(expression), expression.id) if found is None else found
-        if isinstance(expression, ast.Attribute) and expression.attr in self._code.co_names:
-            owner = self._full_name(expression.value)
-            return owner and f"{owner}.{expression.attr}"
-        return ""
-
-    def _seen_with_parts(self, expression: ast.expr | None) -> tuple[Seen, tuple[Seen, ...]]:
-        if isinstance(expression, ast.Tuple):
-            return None, tuple(map(self._seen, expression.elts))
-        return (None if expression is None else self._seen(expression)), ()
-
-    def _seen(self, expression: ast.expr) -> Seen:
+    def _value(self, expression: ast.expr) -> Value:
         """Return what an expression is, and note what the calls in it take."""
         match expression:
             case ast.Name(id=name):
-                return None if name in self._code.co_cellvars else self.names.get(name)
+                return self._value_of_name(name)
+            case ast.Attribute(value=value, attr=name):
+                owner = self._value(value)
+                # A name that the code does not have is of a file that was changed since.
+                return f"{owner}.{name}" if isinstance(owner, str) and name in self._code.co_names else None
             case ast.Call():
                 return self._call(expression)
+            case ast.Tuple(elts=elements):
+                return tuple(map(self._value, elements))
             case ast.Subscript(value=value, slice=index):
-                return _of_item(self._seen(value), index)
+                return _item(self._value(value), index)
             case ast.BinOp(left=left, right=right):
-                sides = self._seen(left), self._seen(right)
-                numbers = [isinstance(side, ast.Constant) for side in (left, right)]
-                return sides[numbers.index(False)] if sum(numbers) == 1 else None
-            case ast.NamedExpr(target=target, value=value):
-                self.names[target.id] = self._seen(value)
-                return self.names[target.id]
-            case ast.IfExp() | ast.BoolOp() | ast.Lambda() | ast.ListComp() | ast.SetComp() | ast.DictComp():
+                images = [self._value(side) for side in (left, right) if not isinstance(side, ast.Constant)]
+                return images[0] if len(images) == 1 and isinstance(images[0], TracedImage) else None
+            case ast.NamedExpr(target=ast.Name(id=name), value=value):
+                self._names[name] = self._value(value)
+                return self._names[name]
+            case ast.IfExp() | ast.BoolOp() | ast.Lambda():
                 return None
-            case ast.GeneratorExp():
+            case ast.ListComp() | ast.SetComp() | ast.DictComp() | ast.GeneratorExp():
                 return None
         for part in ast.iter_child_nodes(expression):
             if isinstance(part, ast.expr):
-                self._seen(part)
+                self._value(part)
         return None
 
-    def _call(self, call: ast.Call) -> Seen:
-        images = [self._seen(argument) for argument in call.args]
-        keywords = {keyword.arg or "**": self._seen(keyword.value) for keyword in call.keywords}
-        library, name = library_name(self._full_name(call.func))
-        if any(isinstance(argument, ast.Starred) for argument in call.args) or "**" in keywords:
-            return None
-        if library == "cv2" and name == "cvtColor":
-            return self._conversion(call, images, keywords)
-        if "dst" in keywords or "out" in keywords:
-            self._forget()
-            return None
-        if library in {"cv2", "numpy", "skimage", PLOT}:
-            first = [keywords[key] for key in ("src", "image", "X") if key in keywords and not images]
-            return self.library_call(library, name, images or first, keywords)
-        if isinstance(call.func, ast.Attribute):
-            owner = self._seen(call.func.value)
-            if owner == PLOT:
-                return self.library_call(PLOT, name or call.func.attr, images, keywords)
-            return owner if call.func.attr in PASSING_METHODS else None
-        helper = self._object(call.func)
-        return self._helper(helper, images, keywords) if isinstance(helper, FunctionType) else None
+    def _value_of_name(self, name: str) -> Value:
+        if name in self._code.co_cellvars:  # a nested function may change it
+            return found if isinstance(found := self._names.get(name), str) else None
+        if name in self._code.co_varnames:
+            return self._names.get(name)
+        return _value_of(self._closure[name].cell_contents if name in self._closure else self._globals.get(name), name)
 
-    def _conversion(self, call: ast.Call, images: Sequence[Seen], keywords: Mapping[str, Seen]) -> Seen:
-        codes = [*call.args[1:2], *(each.value for each in call.keywords if each.arg == "code")]
-        image = images[0] if images else keywords.get("src")
-        library, name = library_name(self._full_name(codes[0]) if codes else "")
-        made = self.convert(image, name) if library == "cv2" else None
-        if len(images) > 2 or "dst" in keywords:
-            self._forget()
+    def _call(self, call: ast.Call) -> Value:
+        function = self._value(call.func)
+        arguments = [self._value(argument) for argument in call.args]
+        keywords = {keyword.arg: self._value(keyword.value) for keyword in call.keywords}
+        named = {key: value for key, value in keywords.items() if key is not None}
+        if any(isinstance(argument, ast.Starred) for argument in call.args) or len(named) < len(keywords):
+            return None
+        if isinstance(call.func, ast.Attribute) and call.func.attr in _PASSING_METHODS:
+            owner = self._value(call.func.value)
+            if isinstance(owner, TracedImage):
+                return owner
+        made = self.call(function, arguments, named)
+        if not named.keys().isdisjoint(("dst", "out")) or (function == "cv2.cvtColor" and len(arguments) > 2):
+            self._forget_written()
             return None
         return made
 
-    def _helper(self, function: FunctionType, images: Sequence[Seen], keywords: Mapping[str, Seen]) -> Seen:
-        """Take what another function of the user takes, and return what it returns."""
-        use = _use_of(function, self._depth - 1)
-        code = function.__code__
-        places = {name: place for place, name in enumerate(code.co_varnames[: code.co_argcount])}
-        given = dict(enumerate(images)) | {places[key]: seen for key, seen in keywords.items() if key in places}
-        for orders, is_hint in ((use.taken, False), (use.hinted, True)):
-            for place, order in orders.items():
-                self.take(given.get(place), order, is_hint=is_hint)
-        if not isinstance(use.returned, Passed):
-            return use.returned
-        seen = given.get(use.returned.place)
-        return swapped(seen) if use.returned.is_swapped else seen
-
-    # -- statements ------------------------------------------------------------------------------------------------
+    # -- statements -----------------------------------------------------------------------------------------------
 
     def _follow(self, statements: Iterable[ast.stmt]) -> bool:
         """Follow statements; return whether they end the call."""
-        return any(not self._is_sure or self._ends(statement) for statement in statements)
+        return any(map(self._ends, statements))
 
     def _ends(self, statement: ast.stmt) -> bool:
         match statement:
             case ast.Return(value=value):
-                self._returned.append(self._seen_with_parts(value))
+                self._returned.add(self._value(value) if value is not None else None)
                 return True
             case ast.Raise():
                 return True
             case ast.Expr(value=value):
-                self._seen(value)
+                self._value(value)
             case ast.Assign(targets=targets, value=value):
-                self._assign(targets, value)
+                made = self._value(value)
+                for target in targets:
+                    self._assign(target, made, value)
             case ast.AnnAssign(target=target, value=ast.expr() as value):
-                self._assign([target], value)
-            case ast.Import() | ast.ImportFrom():
-                self._import(statement)
+                self._assign(target, self._value(value), value)
+            case ast.Import(names=names) | ast.ImportFrom(names=names):
+                for alias in names:
+                    self._import(alias, statement)
             case ast.With(items=items, body=body):
-                self._forget(name for item in items for name in _stored(item))
+                for item in items:
+                    self._names.update(dict.fromkeys(_stored(item)))
                 return self._follow(body)
             case ast.If(test=test) if _is_about_shape(test):
                 return self._branch(statement)
-            case ast.Assert() | ast.Pass() | ast.AnnAssign():
-                pass
             case _:
-                self._skip(statement)
+                return self._skip(statement)
         return False
 
-    def _assign(self, targets: Sequence[ast.expr], value: ast.expr) -> None:
-        seen, parts = self._seen_with_parts(value)
-        for target in targets:
-            match target:
-                case ast.Name(id=name):
-                    self.names[name] = seen
-                    self._imported.pop(name, None)
-                case ast.Tuple(elts=elements) | ast.List(elts=elements) if all(
-                    isinstance(element, ast.Name) for element in elements
-                ):
-                    each = parts if len(parts) == len(elements) else (seen if seen == PLOT else None,) * len(elements)
-                    self.names.update(zip((name.id for name in elements if isinstance(name, ast.Name)), each))  # noqa: B905
-                case ast.Attribute():
-                    pass
-                case ast.Subscript() if _is_colour(value):
-                    pass  # it is drawn into
-                case _:
-                    self._forget(_stored(target))
-                    self._forget()
+    def _assign(self, target: ast.expr, made: Value, value: ast.expr) -> None:
+        match target:
+            case ast.Name(id=name):
+                self._names[name] = made
+            case ast.Tuple(elts=elements) | ast.List(elts=elements):
+                parts: Sequence[Value] = [made if made == "matplotlib" else None] * len(elements)
+                if isinstance(made, tuple) and len(made) == len(elements):
+                    parts = made
+                for element, part in zip(elements, parts, strict=True):
+                    self._assign(element, part, value)
+            case ast.Attribute():
+                pass
+            case ast.Subscript() if _is_colour(value):
+                pass  # it is drawn into
+            case _:
+                self._names.update(dict.fromkeys(_stored(target)))
+                self._forget_written()
 
-    def _import(self, statement: ast.Import | ast.ImportFrom) -> None:
-        for alias in statement.names:
-            if isinstance(statement, ast.Import):
-                name = alias.name if alias.asname else alias.name.partition(".")[0]
-                self._imported[alias.asname or name] = name
-            elif statement.module and not statement.level:
-                self._imported[alias.asname or alias.name] = f"{statement.module}.{alias.name}"
+    def _import(self, alias: ast.alias, statement: ast.Import | ast.ImportFrom) -> None:
+        name = alias.asname or alias.name.partition(".")[0]
+        if isinstance(statement, ast.Import):
+            self._names[name] = alias.name if alias.asname else name
+        else:
+            self._names[name] = None if statement.level else f"{statement.module}.{alias.name}"
 
     def _branch(self, statement: ast.If) -> bool:
         """Follow both branches; afterwards a name is what it is at the end of both."""
-        before = dict(self.names)
-        if self._follow(statement.body):
-            self.names = before
-            return self._follow(statement.orelse)
-        after, self.names = self.names, before
-        if self._follow(statement.orelse):
-            self.names = after
-        else:
-            self.names = {name: seen for name, seen in after.items() if self.names.get(name) == seen}
-        return False
+        before, ends = self._names, []
+        for body in (statement.body, statement.orelse):
+            self._names = dict(before)
+            if not self._follow(body):
+                ends.append(self._names)
+        if ends:
+            self._names = {name: value for name, value in ends[0].items() if ends[-1].get(name) == value}
+        return not ends
 
-    def _skip(self, statement: ast.stmt) -> None:
-        """Pass over a statement that is not done in every call, or done repeatedly."""
-        self._forget(_stored(statement))
+    def _skip(self, statement: ast.stmt) -> bool:
+        """Pass over a statement that is not done in every call, or repeatedly; with a return in it, nothing is sure."""
         parts = [*ast.walk(statement)]
+        self._names.update(dict.fromkeys(_stored(statement)))
         if any(isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store) for part in parts):
-            self._forget()
-        if any(isinstance(part, ast.Return) for part in parts):
-            self._is_sure = False
+            self._forget_written()
+        may_end = any(isinstance(part, ast.Return) for part in parts)
+        if may_end:
+            self._returned.add(None)
+        return may_end
 
-    def _forget(self, names: Iterable[str] | None = None) -> None:
-        """Forget what names are; without names, of all whose arrays can be written into."""
-        for name in [*self.names] if names is None else names:
-            if names is not None or name not in self._untouched:
-                self.names[name] = None
-                self._imported.pop(name, None)
+    def _forget_written(self) -> None:
+        """Forget the images that can be written into: any of them may be what was written into just now."""
+        for name, value in self._names.items():
+            if name not in self._untouched and not isinstance(value, str):
+                self._names[name] = None
 
 
-def _of_item(seen: Seen, index: ast.expr) -> Seen:
+def _item(value: Value, index: ast.expr) -> Value:
     """Return what a part of an image is: rows and columns keep the channels, ``[..., ::-1]`` exchanges them."""
-    if seen == PLOT or not isinstance(seen, Passed | str):
-        return seen
+    if not isinstance(value, TracedImage):
+        return value if value == "matplotlib" else None
     axes = index.elts if isinstance(index, ast.Tuple) else [index]
-    if not axes or len(axes) > 3:
+    if axes and isinstance(axes[0], ast.Constant) and axes[0].value is Ellipsis:
+        axes = [*[ast.Slice()] * (4 - len(axes)), *axes[1:]]
+    if not 0 < len(axes) <= 3 or not all(isinstance(axis, ast.Slice) for axis in axes):
         return None
-    starts_with_rest = isinstance(axes[0], ast.Constant) and axes[0].value is Ellipsis
-    if not all(isinstance(axis, ast.Slice) for axis in axes[starts_with_rest:]):
-        return None
-    last = axes[-1] if len(axes) == 3 or (starts_with_rest and len(axes) == 2) else None
-    if not isinstance(last, ast.Slice):
-        return seen if not starts_with_rest else None
-    lower, upper, step = (ast.unparse(end) if end is not None else "" for end in (last.lower, last.upper, last.step))
-    if (lower, upper, step) == ("", "", "-1"):
-        return swapped(seen)
-    return seen if lower in ("", "0") and upper in ("", "3") and not step else None
+    channels = ast.unparse(axes[2]) if len(axes) == 3 else ":"
+    if channels == "::-1":
+        return _swapped(value)
+    return value if channels in _PASSED_CHANNELS else None
 
 
 def _is_about_shape(test: ast.expr) -> bool:
     """Whether a condition asks for the shape or dtype of arrays alone, or whether something is None."""
     match test:
-        case ast.BoolOp(values=values):
-            return all(map(_is_about_shape, values))
-        case ast.UnaryOp(op=ast.Not(), operand=operand):
-            return _is_about_shape(operand)
         case ast.Compare(left=ast.Name(), ops=[ast.Is() | ast.IsNot()], comparators=[ast.Constant(value=None)]):
             return True
-        case ast.Compare(left=left, comparators=others):
-            return all(map(_is_shape_or_constant, [left, *others]))
-    return False
-
-
-def _is_shape_or_constant(expression: ast.expr) -> bool:
-    match expression:
-        case ast.Constant():
-            return True
-        case ast.Tuple(elts=elements):
-            return all(map(_is_shape_or_constant, elements))
         case ast.Attribute(value=ast.Name(), attr=name):
-            return name in _ABOUT_SHAPE or name.startswith(("uint", "int", "float", "bool"))
-        case ast.Subscript(value=value):
-            return _is_shape_or_constant(value)
-        case ast.Call(func=ast.Name(id="len"), args=[argument]):
-            return _is_shape_or_constant(argument)
-        case ast.UnaryOp(operand=operand):
-            return _is_shape_or_constant(operand)
-    return False
+            return _ABOUT_SHAPE.fullmatch(name) is not None
+        case ast.Name(id=name):
+            return name == "len"
+        case ast.BoolOp() | ast.UnaryOp() | ast.Compare() | ast.Tuple() | ast.Subscript() | ast.Slice() | ast.Call():
+            return all(_is_about_shape(part) for part in ast.iter_child_nodes(test) if isinstance(part, ast.expr))
+    return isinstance(test, ast.Constant)
 
 
 def _is_colour(value: ast.expr) -> bool:
@@ -431,14 +471,10 @@ def _is_colour(value: ast.expr) -> bool:
 
 
 def _stored(node: ast.AST) -> set[str]:
-    """Return the names that a part of a function assigns to, or defines."""
+    """Return the names that a part of a function assigns to, defines, imports or catches."""
     found: set[str] = set()
     for part in ast.walk(node):
-        match part:
-            case ast.Name(id=name, ctx=ast.Store() | ast.Del()):
-                found.add(name)
-            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
-                found.add(name)
-            case ast.alias(name=name, asname=written):
-                found.add(written or name.partition(".")[0])
+        if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load):
+            found.add(part.id)
+        found.update(name.partition(".")[0] for key in ("name", "asname", "rest") if (name := getattr(part, key, None)))
     return found

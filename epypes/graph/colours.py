@@ -7,14 +7,13 @@ a blur does, has the order on both sides of the function. Only what is sure coun
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.colour_names import Passed, Seen, opposite
-from epypes.graph.colour_use import ColourUse, colour_use, may_tell
+from epypes.graph.colour_use import ColourUse, TracedImage, colour_use, may_tell, opposite
 from epypes.graph.identity import inner_graph
 from epypes.graph.signature import distinct
 from epypes.graph.token_annotations import marks_of
@@ -22,7 +21,7 @@ from epypes.images import Contracts, Order
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
-    from epypes.graph.validation import Delay
+    from epypes.graph.validation import GraphParts
 
 _MARK: Final = "Annotated[np.ndarray, ep.Image(order={!r})]."
 
@@ -79,185 +78,144 @@ def colour_order(cg: CompGraph, token: str) -> Order:
 
 
 def find_orders(
-    functions: Mapping[str, Callable[..., Any]],
-    digraph: BipartiteDigraph,
-    func_io: Mapping[str, Any],
-    contracts: Mapping[str, Contracts],
-    delays: Mapping[str, Delay],
+    parts: GraphParts, digraph: BipartiteDigraph, contracts: Mapping[str, Contracts]
 ) -> tuple[dict[str, ColourOrder], list[Finding]]:
     """Find the orders of colours of tokens, and the tokens that two functions surely want in different ones.
 
     Parameters
     ----------
-    functions
-        The callables by name.
-    digraph, func_io
-        What ``read_io`` returns.
+    parts
+        The graph's parts.
+    digraph
+        What is connected to what.
     contracts
         The marks of images in annotations, by function.
-    delays
-        By token, the token whose previous value it has.
     """
-    search = _Search(functions, digraph, func_io, contracts, delays)
-    search.run()
+    search = _Search(parts, digraph, contracts)
+    functions = parts.functions
+    # A large graph has few functions under many names.
+    telling = {key for key, function in distinct(functions).items() if _is_telling(function)}
+    names = [name for name in digraph.inputs if id(functions.get(name)) in telling]
+    search.spread([*search.marked(), *search.made(names), *search.taken(names)])
+    hints: dict[str, list[ColourOrder]] = {}
+    for token, hint in search.taken(names, is_sure=False):
+        hints.setdefault(token, []).append(hint)
+    for token, (first, *_) in hints.items():
+        if token not in search.orders:
+            reached = search.spread([(token, first)])
+            if any(hint.order != search.orders[each].order for each in reached for hint in hints.get(each, ())):
+                for each in reached:
+                    del search.orders[each]
     return search.orders, search.findings
 
 
 class _Search:
     """Carries what functions say from token to token."""
 
-    def __init__(
-        self,
-        functions: Mapping[str, Callable[..., Any]],
-        digraph: BipartiteDigraph,
-        func_io: Mapping[str, Any],
-        contracts: Mapping[str, Contracts],
-        delays: Mapping[str, Delay],
-    ) -> None:
-        self._functions, self._digraph, self._func_io, self._contracts = functions, digraph, func_io, contracts
-        self._delayed = [(previous, delay.token) for previous, delay in delays.items()]
-        self._uses: dict[int, ColourUse] = {}
-        self._disagreeing: set[tuple[str, str]] = set()
+    def __init__(self, parts: GraphParts, digraph: BipartiteDigraph, contracts: Mapping[str, Contracts]) -> None:
+        self._parts, self._digraph, self._contracts = parts, digraph, contracts
+        self._delayed = [(previous, delay.token) for previous, delay in parts.delays.items()]
+        self._uses: dict[tuple[int, int], ColourUse] = {}
+        self._disagreeing: set[tuple[str, ...]] = set()
         self.orders: dict[str, ColourOrder] = {}
         self.findings: list[Finding] = []
 
-    def run(self) -> None:
-        # A large graph has few functions under many names.
-        telling = {key for key, function in distinct(self._functions).items() if _is_telling(function)}
-        names = [name for name in self._digraph.inputs if id(self._functions.get(name)) in telling]
-        for token, order in (*self._marked(), *self._made(names), *self._taken(names)):
-            self._add(token, order)
-        self._pass_on([*self.orders])
-        self._add_hints(self._hinted(names))
-
     # -- what functions say ----------------------------------------------------------------------------------------
 
-    def _marked(self) -> Iterator[tuple[str, ColourOrder]]:
+    def marked(self) -> Iterator[tuple[str, ColourOrder]]:
         for name, token, mark, verb in marks_of(self._contracts, self._digraph):
             if mark.order is not None:
                 yield token, ColourOrder(mark.order, name, verb, token, is_marked=True)
 
-    def _made(self, names: list[str]) -> Iterator[tuple[str, ColourOrder]]:
+    def made(self, names: Iterable[str]) -> Iterator[tuple[str, ColourOrder]]:
         for name in names:
-            for token, seen in self._outputs(name):
-                if seen == "bgr" or seen == "rgb":
-                    yield token, ColourOrder(seen, name, "makes", token)
+            for token, image in self._outputs(name):
+                if image.place is None:
+                    yield token, ColourOrder("rgb" if image.is_swapped else "bgr", name, "makes", token)
 
-    def _taken(self, names: list[str]) -> Iterator[tuple[str, ColourOrder]]:
+    def taken(self, names: Iterable[str], *, is_sure: bool = True) -> Iterator[tuple[str, ColourOrder]]:
+        """Give the tokens that functions take in an order; if it is not sure, what names alone say."""
         for name in names:
-            for place, order in self._use(name).taken.items():
-                for token in self._input(name, place):
-                    yield token, ColourOrder(order, name, "takes", token)
-
-    def _hinted(self, names: list[str]) -> dict[str, list[ColourOrder]]:
-        """Return by token what names alone say."""
-        found: dict[str, list[ColourOrder]] = {}
-        for name in names:
-            for place, order in self._use(name).hinted.items():
-                for token in self._input(name, place):
-                    hint = ColourOrder(order, name, "takes", token, is_sure=False)
-                    found.setdefault(token, []).append(hint)
-        return found
+            use = self._use(name)
+            for place, order in (use.taken if is_sure else use.hinted).items():
+                if place < len(self._digraph.inputs[name]) and not self._is_marked(name, 0, place):
+                    token = self._digraph.inputs[name][place]
+                    yield token, ColourOrder(order, name, "takes", token, is_sure=is_sure)
 
     def _use(self, name: str) -> ColourUse:
-        function = self._functions.get(name)
-        if id(function) not in self._uses:
-            self._uses[id(function)] = _use_in_graph(function)
-        return self._uses[id(function)]
+        function, count = self._parts.functions.get(name), len(self._digraph.inputs[name])
+        key = id(function), count
+        if key not in self._uses:
+            inner = inner_graph(function)
+            self._uses[key] = colour_use(function, count) if inner is None else _use_of_pipeline(function, inner)
+        return self._uses[key]
 
-    def _input(self, name: str, place: int) -> tuple[str, ...]:
-        """Return the token at a place, unless a mark says its order."""
-        return () if self._mark(name, 0, place) else self._digraph.inputs[name][place : place + 1]
+    def _outputs(self, name: str) -> Iterator[tuple[str, TracedImage]]:
+        """Give the images that a function makes or passes on, but for those of which a mark says the order."""
+        tokens, returned = self._digraph.outputs[name], self._use(name).returned
+        if self._parts.has_single_output(name):
+            returned = (returned,)
+        if isinstance(returned, tuple) and len(returned) == len(tokens):
+            for place, (token, image) in enumerate(zip(tokens, returned, strict=True)):
+                if isinstance(image, TracedImage) and not self._is_marked(name, 1, place):
+                    yield token, image
 
-    def _outputs(self, name: str) -> Iterator[tuple[str, Seen]]:
-        """Give the tokens that a function makes, but for those of which a mark says the order, and what each is."""
-        use, tokens = self._use(name), self._digraph.outputs[name]
-        is_single = name in self._func_io and isinstance(self._func_io[name][1], str)
-        parts = (use.returned,) if is_single else use.parts
-        if len(parts) == len(tokens):
-            for place, pair in enumerate(zip(tokens, parts, strict=True)):
-                if not self._mark(name, 1, place):
-                    yield pair
-
-    def _mark(self, name: str, side: int, place: int) -> Order | None:
+    def _is_marked(self, name: str, side: int, place: int) -> bool:
         marks = self._contracts[name][side] if name in self._contracts else ()
         mark = marks[place] if place < len(marks) else None
-        return mark.order if mark is not None else None
+        return mark is not None and mark.order is not None
 
     # -- from token to token -----------------------------------------------------------------------------------------
 
-    def _pass_on(self, tokens: list[str]) -> list[str]:
-        """Give tokens that are passed on the order of those that are known; return all of them."""
-        pending = deque(tokens)
+    def spread(self, found: Iterable[tuple[str, ColourOrder]]) -> list[str]:
+        """Add orders, and those of the tokens that have the same images; return the tokens that had none."""
+        pending, reached = deque(found), []
         while pending:
-            token = pending.popleft()
-            known = self.orders[token]
-            for other, is_swapped in self._same_image(token):
-                passed = replace(known, order=opposite(known.order)) if is_swapped else known
-                if self._add(other, passed):
-                    pending.append(other)
-                    tokens.append(other)
-        return tokens
-
-    def _add_hints(self, hints: Mapping[str, list[ColourOrder]]) -> None:
-        """Add what names say of tokens of which nothing is sure, unless they disagree."""
-        for token, (first, *_) in hints.items():
+            token, order = pending.popleft()
             if token not in self.orders:
-                self.orders[token] = first
-                reached = self._pass_on([token])
-                if any(hint.order != self.orders[each].order for each in reached for hint in hints.get(each, ())):
-                    for each in reached:
-                        del self.orders[each]
+                self.orders[token] = order
+                reached.append(token)
+                for other, is_swapped in self._same_image(token):
+                    pending.append((other, replace(order, order=opposite(order.order)) if is_swapped else order))
+            elif order.is_sure and order.order != self.orders[token].order:
+                pair = tuple(sorted((self.orders[token].function, order.function)))
+                if pair not in self._disagreeing:
+                    self._disagreeing.add(pair)
+                    self.findings.append(_two_orders(token, self.orders, order))
+        return reached
 
     def _same_image(self, token: str) -> Iterator[tuple[str, bool]]:
-        """Give the tokens that have the same image: a function passes it on, or its delay brings it again."""
+        """Give the tokens that have the same image, perhaps swapped: a function passes it on, or a delay does."""
         for pair in self._delayed:
             if token in pair:
                 yield pair[pair[0] == token], False
         maker = self._digraph.producer.get(token)
         around = [] if maker is None or maker not in self._digraph.inputs else [maker]
         for name in (*around, *self._digraph.consumers.get(token, ())):
-            for made, seen in self._outputs(name):
-                if isinstance(seen, Passed):
-                    for taken in self._digraph.inputs[name][seen.place : seen.place + 1]:
-                        if made != taken and token in (made, taken):
-                            yield taken if token == made else made, seen.is_swapped
-
-    def _add(self, token: str, found: ColourOrder) -> bool:
-        """Add what a function says of a token; return whether it is new. A contradiction becomes a finding."""
-        if token not in self.orders:
-            self.orders[token] = found
-            return True
-        first = self.orders[token]
-        if found.is_sure and first.order != found.order:
-            pair = min(first.function, found.function), max(first.function, found.function)
-            if pair not in self._disagreeing:
-                self._disagreeing.add(pair)
-                self.findings.append(_two_orders(token, self.orders, found))
-        return False
+            inputs = self._digraph.inputs[name]
+            for made, image in self._outputs(name):
+                if image.place is not None and image.place < len(inputs):
+                    taken = inputs[image.place]
+                    if made != taken and token in (made, taken):
+                        yield taken if token == made else made, image.is_swapped
 
 
 def _is_telling(function: object) -> bool:
     return may_tell(function) or inner_graph(function) is not None
 
 
-def _use_in_graph(function: Any) -> ColourUse:
-    """Return the colour use of a function, also of a pipeline: its graph has the orders of its inputs and outputs."""
-    inner = inner_graph(function)
-    if inner is None:
-        return colour_use(function)
+def _use_of_pipeline(function: Any, inner: CompGraph) -> ColourUse:
+    """Return the colour use of a pipeline: its graph has the orders of its inputs and outputs."""
     if not getattr(type(function), "__module__", "").startswith("epypes."):
         return ColourUse()  # a subclass may do something around it
-    free = function.runner.free_source_tokens
-    known = [(place, inner.colours[token]) for place, token in enumerate(free) if token in inner.colours]
-    made = [
-        found.order if (found := inner.colours.get(token)) and found.is_sure else None for token in inner.sink_tokens
-    ]
+    free = enumerate(function.runner.free_source_tokens)
+    known = {place: inner.colours[token] for place, token in free if token in inner.colours}
+    sinks = [inner.colours.get(token) for token in inner.sink_tokens]
+    made = tuple(TracedImage(None, found.order == "rgb") if found and found.is_sure else None for found in sinks)
     return ColourUse(
-        {place: found.order for place, found in known if found.is_sure},
-        {place: found.order for place, found in known if not found.is_sure},
-        made[0] if len(made) == 1 else None,
-        tuple(made),
+        {place: found.order for place, found in known.items() if found.is_sure},
+        {place: found.order for place, found in known.items() if not found.is_sure},
+        made[0] if len(made) == 1 else made,
     )
 
 

@@ -16,7 +16,7 @@ from epypes.graph.identity import is_redefined_inside, redefined
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.signature import declared_outputs, positional_of, signature_of
 from epypes.graph.switch import as_switch
-from epypes.graph.token_annotations import read_contracts
+from epypes.graph.token_annotations import contracts_of, read_hints
 from epypes.graph.validation import Default, Delay, GraphParts, find_problems, read_io
 from epypes.images import Contracts
 from epypes.optional import optional_import
@@ -116,9 +116,10 @@ class CompGraph(OldNames):
         findings = list(parts.findings)
         digraph, func_io = read_io(parts.func_io, findings)
         order = digraph.run_order()
-        contracts = read_contracts(parts.functions, digraph)
-        findings += find_problems(parts, digraph, func_io, contracts, len(order) == len(digraph.inputs))
-        colours, contradictions = find_orders(parts.functions, digraph, func_io, contracts, parts.delays)
+        hints = read_hints(parts, digraph)
+        contracts = contracts_of(hints)
+        findings += find_problems(parts, digraph, hints, contracts, len(order) == len(digraph.inputs))
+        colours, contradictions = find_orders(parts, digraph, contracts)
         findings += contradictions
         if findings:
             raise GraphError(findings)

@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from types import FunctionType
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeGuard, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -69,10 +69,29 @@ def plain_count(function: object) -> int | None:
 
     It is read from the code: ``inspect.signature`` takes 10 us, and a graph may have 10,000 functions.
     """
-    if type(function) is not FunctionType or function.__code__.co_kwonlyargcount:
+    if not _is_plain(function) or function.__code__.co_kwonlyargcount:
         return None
-    is_plain = not function.__dict__ or function.__dict__.keys().isdisjoint(("__wrapped__", "__signature__"))
-    return function.__code__.co_argcount if is_plain else None
+    return function.__code__.co_argcount
+
+
+def positional_names(function: Callable[..., Any]) -> tuple[tuple[str, ...], str]:
+    """Return the names of the parameters that can be given by position, and that of ``*args``; empty if not known."""
+    if _is_plain(function):
+        code, count = function.__code__, function.__code__.co_argcount
+        has_rest = code.co_flags & inspect.CO_VARARGS
+        return code.co_varnames[:count], code.co_varnames[count + code.co_kwonlyargcount] if has_rest else ""
+    signature = signature_of(function)
+    if signature is None:
+        return (), ""
+    rest = (each.name for each in signature.parameters.values() if each.kind is each.VAR_POSITIONAL)
+    return tuple(parameter.name for parameter in positional_of(signature)), next(rest, "")
+
+
+def _is_plain(function: object) -> TypeGuard[FunctionType]:
+    """Whether a function's parameters are those of its code."""
+    if type(function) is not FunctionType:
+        return False
+    return not function.__dict__ or function.__dict__.keys().isdisjoint(("__wrapped__", "__signature__"))
 
 
 def outputs(*names: str) -> Callable[[F], F]:

@@ -1,52 +1,170 @@
-"""Annotations of tokens: the images and the hyperparameter ranges that functions' annotations declare."""
+"""Annotations of tokens: what the annotations of functions say of their inputs and outputs, images and ranges too."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from types import FunctionType, MethodType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.signature import distinct
-from epypes.hints import Param, Roi, annotated_param
-from epypes.images import Contracts, Image, contracts_of, is_marked
+from epypes.graph.identity import innermost
+from epypes.graph.signature import distinct, positional_names
+from epypes.hints import Param, Roi, param_of
+from epypes.images import Contracts, Image, mark_of
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
+    from epypes.graph.validation import GraphParts
+
+_NO_HINTS: Final[Mapping[str, Any]] = {}
+# Weak, so that a function of a notebook that was defined again can go. To evaluate annotations takes some 30 us.
+_EVALUATED: Final[WeakKeyDictionary[FunctionType, Mapping[str, Any]]] = WeakKeyDictionary()
+
+
+class TokenHints(NamedTuple):
+    """The type hints of the tokens of one function; Any where there is none.
+
+    Attributes
+    ----------
+    inputs
+        By input token. ``*args`` speak for every input that they take.
+    outputs
+        By output token; of a returned tuple by its items, which may be of another number. ``tuple[A, ...]`` speaks for
+        every output.
+    returned
+        Of the value.
+    marks
+        The marks of images by input and by output token, None where there is none; None without any. ``list[A]``
+        speaks for every output.
+    """
+
+    inputs: tuple[Any, ...]
+    outputs: tuple[Any, ...]
+    returned: Any
+    marks: Contracts | None
+
+
+def read_hints(parts: GraphParts, digraph: BipartiteDigraph) -> dict[str, TokenHints]:
+    """Return the type hints of tokens by function; functions without annotations are left out.
+
+    If types are not compared, also those that have no marks of images.
+    """
+    annotated = {
+        key
+        for key, function in distinct(parts.functions).items()
+        if _is_annotated(function) and (parts.types or _is_marked(function))
+    }
+    found: dict[str, TokenHints] = {}
+    # A large graph has few functions under many names.
+    read: dict[tuple[int, int, int | None], TokenHints | None] = {}
+    for name, tokens in digraph.inputs.items():
+        function = parts.functions.get(name)
+        if function is not None and id(function) in annotated:
+            count = None if parts.has_single_output(name) else len(digraph.outputs[name])
+            key = id(function), len(tokens), count
+            if key not in read:
+                read[key] = _hints_of_tokens(function, len(tokens), count)
+            hints = read[key]
+            if hints is not None:
+                found[name] = hints
+    return found
+
+
+def _is_annotated(function: Any) -> bool:
+    if type(function) is FunctionType:
+        try:
+            return bool(function.__annotations__)
+        except Exception:  # Python 3.14 evaluates them here; what that raises is the user's
+            return False
+    # Other objects show the annotations of their class, which are not those of a call.
+    return type(function) is MethodType or innermost(function) is not function
+
+
+def _hints_of(function: object) -> Mapping[str, Any]:
+    """Return the type hints of a function by parameter, and that of ``return``; not to be changed.
+
+    ``Annotated`` is kept. Empty where there are none, and where they can't be evaluated: a name that is not defined
+    yet, a class that others have nothing to do with, whatever the text of an annotation raises.
+    """
+    if not isinstance(function, FunctionType):
+        return _evaluated(function) or _NO_HINTS
+    hints = _EVALUATED.get(function)
+    if hints is None:
+        hints = _evaluated(function)
+        if hints is None:
+            return _NO_HINTS  # and not for good: the names may be defined later
+        _EVALUATED[function] = hints
+    return hints
+
+
+def _evaluated(function: Any) -> Mapping[str, Any] | None:
+    try:
+        return typing.get_type_hints(function, include_extras=True)
+    except Exception:  # what the text of an annotation raises is the user's
+        return None
+
+
+def _is_marked(function: Any) -> bool:
+    return any(mark_of(part) for hint in _hints_of(function).values() for part in (hint, *typing.get_args(hint)))
+
+
+def _hints_of_tokens(function: Any, inputs: int, outputs: int | None) -> TokenHints | None:
+    """Read the hints of a function with so many inputs and outputs, None for the value as it is."""
+    hints = _hints_of(function)
+    if not hints:
+        return None
+    names, rest = positional_names(function)
+    taken = [*(hints.get(name, Any) for name in names), *[hints.get(rest, Any)] * (inputs - len(names))]
+    returned = hints.get("return", Any)
+    made = (returned,) if outputs is None else _items(returned, outputs)
+    # The items of a list may be of several types, as those of [keypoints, None]: its images alone are known.
+    shown = typing.get_args(returned) * len(made) if outputs and typing.get_origin(returned) is list else made
+    marked = tuple(map(mark_of, shown)) if outputs in (None, len(made)) else (None,) * (outputs or 0)
+    marks = tuple(map(mark_of, taken[:inputs])), marked
+    return TokenHints(tuple(taken[:inputs]), made, returned, marks if any(map(any, marks)) else None)
+
+
+def _items(returned: Any, count: int) -> tuple[Any, ...]:
+    """Return the hints of a tuple's items; Any for each of ``count`` where the hint says nothing about them."""
+    plain = bare(returned)
+    items = typing.get_args(plain) if typing.get_origin(plain) is tuple else ()
+    if items[1:] == (Ellipsis,):
+        return items[:1] * count
+    return items if items and not any(map(_is_unpacked, items)) else (Any,) * count
+
+
+def _is_unpacked(item: Any) -> bool:
+    return typing.get_origin(item) is typing.Unpack or getattr(item, "__unpacked__", False)
+
+
+def bare(hint: Any) -> Any:
+    """Return a hint without its ``Annotated``, and what a ``type`` alias stands for."""
+    origin = typing.get_origin(hint)
+    if origin is typing.Annotated:
+        return bare(typing.get_args(hint)[0])
+    if type(hint).__name__ == "TypeAliasType":
+        return bare(hint.__value__)
+    if type(origin).__name__ == "TypeAliasType":  # NDArray[np.uint8], from Python 3.12 on
+        return bare(origin.__value__[typing.get_args(hint)])
+    return hint
 
 
 def annotated_params(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
-    """Give the hints in the annotations of the functions that take a token, in run order."""
-    for function in cg.digraph.consumers.get(token, ()):
-        found = annotated_param(cg.functions[function], cg.func_inputs(function).index(token))
+    """Give the ranges in the annotations of the functions that take a token, in run order."""
+    for name in cg.digraph.consumers.get(token, ()):
+        function, tokens = cg.functions[name], cg.func_inputs(name)
+        hints = _hints_of_tokens(function, len(tokens), None) if _is_annotated(function) else None
+        found = param_of(hints.inputs[tokens.index(token)]) if hints is not None else None
         if found is not None:
             yield found
 
 
-def image_hint(cg: CompGraph, token: str) -> Image | None:
-    """Return the mark of a token as an image, None without any.
-
-    It is the mark on the output of the function that makes it, else the first one with an order on an input of those
-    that take it.
-    """
-    cg.require_token(token)
-    made = None
-    for _, name, mark, verb in marks_of(cg.contracts, cg.digraph):
-        if name == token and mark.order is not None:
-            return mark
-        if name == token and verb == "makes":
-            made = mark
-    return made
-
-
-def read_contracts(functions: Mapping[str, Callable[..., Any]], digraph: BipartiteDigraph) -> dict[str, Contracts]:
-    """Return the marks of images in the annotations of functions, by name; functions without any are left out."""
-    marked = {key for key, function in distinct(functions).items() if is_marked(function)}
-    return {
-        name: contracts_of(functions[name], len(tokens), len(digraph.outputs[name]))
-        for name, tokens in digraph.inputs.items()
-        if id(functions.get(name)) in marked
-    }
+def contracts_of(hints: Mapping[str, TokenHints]) -> dict[str, Contracts]:
+    """Return the marks of images by function; functions without any are left out."""
+    return {name: each.marks for name, each in hints.items() if each.marks is not None}
 
 
 def check_images(contracts: Mapping[str, Contracts], digraph: BipartiteDigraph) -> Iterable[Finding]:

@@ -10,14 +10,11 @@ import types
 import typing
 from abc import ABCMeta
 from collections.abc import Iterable, Iterator, Mapping
-from types import FunctionType, MethodType
-from typing import Annotated, Any, Final, Literal, Union
+from typing import Any, Final, Literal, Union
 
-from epypes.annotations import hints_of
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.identity import innermost
-from epypes.graph.signature import distinct, positional_of, signature_of
+from epypes.graph.token_annotations import TokenHints, bare
 
 # A finding is a sentence; a long type is cut.
 _WIDEST: Final = 60
@@ -25,42 +22,31 @@ _WIDEST: Final = 60
 _BYTES: Final = frozenset({bytes, bytearray, memoryview})
 
 
-def check_types(
-    functions: Mapping[str, Any], digraph: BipartiteDigraph, func_io: Mapping[str, Any]
-) -> Iterable[Finding]:
+def check_types(hints: Mapping[str, TokenHints], digraph: BipartiteDigraph) -> Iterable[Finding]:
     """Find tokens that are made as one type and taken as another, and tuples of another length than the outputs.
 
     Parameters
     ----------
-    functions
-        The callables by name.
+    hints
+        The annotations by function.
     digraph
         What is connected to what.
-    func_io
-        The io by function name, as it was written.
     """
-    # A large graph has few functions under many names.
-    read = {key: _read(function) for key, function in distinct(functions).items() if _is_annotated(function)}
-    hints = {name: read[id(function)] for name, function in functions.items() if id(function) in read}
     made: dict[str, Any] = {}
-    for name, (_, returned) in hints.items():
-        outputs = func_io[name][1] if name in func_io else None
-        if isinstance(outputs, str):
-            made[outputs] = returned
+    for name, each in hints.items():
+        outputs = digraph.outputs[name]
+        if len(each.outputs) == len(outputs):
+            made.update(zip(outputs, each.outputs, strict=True))
         elif outputs:
-            items = _items(returned, len(outputs))
-            if len(items) == len(outputs):
-                made.update(zip(outputs, items, strict=True))
-            else:
-                text = (
-                    f"Function {name!r} returns {_type_text(returned)}, {len(items)} values, but its io names "
-                    f"{len(outputs)} outputs: ({', '.join(outputs)}). "
-                    "Name as many, or build the graph with types=False."
-                )
-                yield Finding("types", text, (name, *outputs))
+            text = (
+                f"Function {name!r} returns {_type_text(each.returned)}, {len(each.outputs)} values, but its io names "
+                f"{len(outputs)} outputs: ({', '.join(outputs)}). "
+                "Name as many, or build the graph with types=False."
+            )
+            yield Finding("types", text, (name, *outputs))
     known: dict[tuple[int, int], bool] = {}
-    for taker, (taken, _) in hints.items():
-        for token, hint in zip(digraph.inputs.get(taker, ()), taken, strict=False):
+    for taker, each in hints.items():
+        for token, hint in zip(digraph.inputs[taker], each.inputs, strict=True):
             as_made = made.get(token, hint)
             if as_made is hint:
                 continue
@@ -75,34 +61,6 @@ def check_types(
                     "Change one of the annotations, or build the graph with types=False."
                 )
                 yield Finding("types", text, (token, maker, taker))
-
-
-def _read(function: Any) -> tuple[tuple[Any, ...], Any]:
-    """Return the hint of each positional parameter, and of the return value; Any where there is none."""
-    hints = hints_of(function)
-    signature = signature_of(function) if hints else None
-    positional = positional_of(signature) if signature is not None else ()
-    return tuple(hints.get(parameter.name, Any) for parameter in positional), hints.get("return", Any)
-
-
-def _is_annotated(function: Any) -> bool:
-    if type(function) is FunctionType:
-        return bool(function.__annotations__)
-    # Other objects show the annotations of their class, which are not those of a call.
-    return type(function) is MethodType or innermost(function) is not function
-
-
-def _items(returned: Any, count: int) -> tuple[Any, ...]:
-    """Return the hints of a tuple's items; Any for each of ``count`` where the hint says nothing about them."""
-    plain = _bare(returned)
-    items = typing.get_args(plain) if typing.get_origin(plain) is tuple else ()
-    if len(items) == 2 and items[1] is Ellipsis:
-        return (items[0],) * count
-    return items if items and not any(map(_is_unpacked, items)) else (Any,) * count
-
-
-def _is_unpacked(item: Any) -> bool:
-    return typing.get_origin(item) is typing.Unpack or getattr(item, "__unpacked__", False)
 
 
 def _type_text(hint: Any) -> str:
@@ -122,21 +80,9 @@ def are_disjoint(left: Any, right: Any) -> bool:
     return all(_exclude(one, other) for one in _alternatives(left) for other in _alternatives(right))
 
 
-def _bare(hint: Any) -> Any:
-    """Return a hint without its ``Annotated``, and what a ``type`` alias stands for."""
-    origin = typing.get_origin(hint)
-    if origin is Annotated:
-        return _bare(typing.get_args(hint)[0])
-    if type(hint).__name__ == "TypeAliasType":
-        return _bare(hint.__value__)
-    if type(origin).__name__ == "TypeAliasType":  # NDArray[np.uint8], from Python 3.12 on
-        return _bare(origin.__value__[typing.get_args(hint)])
-    return hint
-
-
 def _alternatives(hint: Any) -> Iterator[Any]:
     """Give the members of a union, and the types of a literal's values; any other hint alone, without ``Annotated``."""
-    plain = _bare(hint)
+    plain = bare(hint)
     if typing.get_origin(plain) in (Union, types.UnionType):
         for member in typing.get_args(plain):
             yield from _alternatives(member)

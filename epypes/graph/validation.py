@@ -16,7 +16,7 @@ from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.identity import is_same_default
 from epypes.graph.signature import distinct, plain_count, positional_of, signature_of
 from epypes.graph.switch import as_switch
-from epypes.graph.token_annotations import check_images
+from epypes.graph.token_annotations import TokenHints, check_images
 from epypes.graph.type_check import check_types
 from epypes.images import Contracts
 from epypes.wording import counted
@@ -78,6 +78,10 @@ class GraphParts:
     findings: list[Finding] = field(default_factory=list)
     delays: dict[str, Delay] = field(default_factory=dict)
 
+    def has_single_output(self, name: str) -> bool:
+        """Whether a function's value is one token as it is, not a sequence of tokens."""
+        return isinstance(self.func_io[name][1], str)
+
 
 def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[BipartiteDigraph, dict[str, Any]]:
     """Read the paper's func_io; what can't be read becomes a finding and is left out.
@@ -123,7 +127,7 @@ def _tokens(side: Any) -> tuple[str, ...]:
 def find_problems(
     parts: GraphParts,
     digraph: BipartiteDigraph,
-    func_io: Mapping[str, Any],
+    hints: Mapping[str, TokenHints],
     contracts: Mapping[str, Contracts],
     is_acyclic: bool,
 ) -> Iterable[Finding]:
@@ -133,10 +137,10 @@ def find_problems(
     ----------
     parts
         The graph's parts.
-    digraph, func_io
-        What ``read_io`` returns.
-    contracts
-        What the annotations say of images, by function.
+    digraph
+        What is connected to what.
+    hints, contracts
+        The annotations, and the marks of images among them, by function.
     is_acyclic
         Whether the run order has every function.
     """
@@ -154,7 +158,7 @@ def find_problems(
     yield from _check_special_functions(functions, digraph)
     if parts.types:
         yield from check_images(contracts, digraph)
-        yield from check_types(functions, digraph, func_io)
+        yield from check_types(hints, digraph)
     # A token that is made needs no default.
     yield from _check_defaults(default for default in parts.defaults if default.token not in digraph.producer)
     yield from _check_groups(functions, parts.groups)

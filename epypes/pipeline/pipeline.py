@@ -128,14 +128,7 @@ class Pipeline(Node, TokenMapping):
 
     def __epypes_call_with_state__(self, state: Mapping[str, Any], inputs: tuple[Any, ...]) -> tuple[Any, Any]:
         """Call the pipeline with a state that the caller keeps; return its value and the state after."""
-        runner = self.runner
-        with runner._series:
-            own = runner._kept
-            runner.state = state
-            try:
-                return self(*inputs), runner.state
-            finally:
-                runner._kept = own
+        return self.runner.call_with_state(state, lambda: self(*inputs))
 
     @property
     def state(self) -> Mapping[str, Any]:

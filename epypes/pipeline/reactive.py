@@ -163,20 +163,39 @@ class EventView(OldNames, Mapping[str, Any]):
         return f"<EventView of {self.name!r:.40}: {len(self)} tokens>"
 
 
-class _Answering(Pipeline):
+class _Reactive(Pipeline):
+    """What the reactive pipelines have in common: where events are."""
+
+    # The events under way, by the thread that works on them.
+    _events: dict[int, EventView]
+    # Where the last event that failed did so, what was raised, and how many had been worked on.
+    _failed_last: tuple[str, str, int] = ("", "", 0)
+
+    def _where(self) -> list[str]:
+        """Return where the events under way are: one, unless several threads work on events."""
+        return [view.stage for view in tuple(self._events.values()) if view.stage]
+
+    def _function_stage(self, name: str) -> Stage:
+        """Look at f_in or f_out; it has failed if the last event did so in it."""
+        failed_in, message, count = self._failed_last
+        failure = message if failed_in == name and count == self.run_count else ""
+        state: StageState = "running" if name in self._where() else "failed" if failure else "static"
+        its_own = _function_name(getattr(self, name))
+        return Stage("function", name, state, tuple(note for note in (its_own, failure) if note and note != name))
+
+
+class _Answering(_Reactive):
     """What SourcePipeline and FullPipeline have in common: they put ``f_out(view)`` on ``q_out``."""
 
     q_out: Any
     f_out: FOut
-    # The events under way, by the thread that works on them.
-    _events: dict[int, EventView]
 
     def emit(self, event: Any, run: Run) -> None:
         """Put what f_out makes of the event's run on q_out. The hook for subclasses."""
         view = self._events.get(get_ident())
         if view is None or view.event is not event:
             view = EventView(self.name, event, "f_out")
-        view.run, view.attributes = run, dict(self.attributes)
+        view.run, view.attributes = run, self.attributes.copy()
         view.f_out_start = perf_counter_ns()
         answer = self.f_out(view)
         view.f_out_end = perf_counter_ns()
@@ -187,13 +206,10 @@ class _Answering(Pipeline):
         """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
         self.q_out.put(answer)
 
-    def _stages_after(self, failure: str) -> tuple[Stage, Stage]:
-        """Return f_out and q_out as they are at this moment; ``failure`` is what f_out raised for the last event."""
-        where = _where(self._events)
-        return (
-            _function_stage("f_out", self.f_out, is_running="f_out" in where, failure=failure),
-            queue_stage("q_out", self.q_out, is_waited_for="q_out" in where),
-        )
+    def _stages_after(self) -> tuple[Stage, Stage]:
+        """Return f_out and q_out as they are at this moment."""
+        is_waited_for = "q_out" in self._where()
+        return self._function_stage("f_out"), queue_stage("q_out", self.q_out, is_waited_for=is_waited_for)
 
 
 class SourcePipeline(_Answering):
@@ -238,10 +254,10 @@ class SourcePipeline(_Answering):
     @property
     def stages(self) -> Stages:
         """f_out and q_out, as they are at this moment."""
-        return Stages(after=self._stages_after(""))
+        return Stages(after=self._stages_after())
 
 
-class SinkPipeline(Pipeline):
+class SinkPipeline(_Reactive):
     """A Pipeline that runs for every event on ``q_in``.
 
     An event that a broker has delivered is acknowledged when it has been answered, and rejected, with the reason, when
@@ -283,10 +299,8 @@ class SinkPipeline(Pipeline):
         self.q_in, self.f_in = q_in, f_in
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
-        self._events: dict[int, EventView] = {}
+        self._events = {}
         self._attempts = _Attempts()
-        # Where the last event that failed did so, what was raised, and how many had been worked on.
-        self._failed_last: tuple[str, str, int] = ("", "", 0)
         # By thread, the f_in of its loop, if that has its own.
         self._f_ins: dict[int, FIn] = {}
         # The event that `handle` has settled last on each thread.
@@ -331,7 +345,7 @@ class SinkPipeline(Pipeline):
             view.stage = "f_out"
             if f_out is None:
                 self.emit(event, run)
-            else:
+            else:  # as emit does it, with what has been looked up
                 view.run, view.attributes = run, self.attributes.copy()
                 view.f_out_start = clock()
                 answer = f_out(view)
@@ -355,29 +369,16 @@ class SinkPipeline(Pipeline):
     @property
     def _busy(self) -> tuple[str, ...]:
         """What has not returned, for errors: functions of the graph, or f_in, or f_out, or the put on q_out."""
-        where = [stage for stage in _where(self._events) if stage != "graph"]
+        where = [stage for stage in self._where() if stage != "graph"]
         return self.runner.running or tuple("put on q_out" if stage == "q_out" else stage for stage in where)
 
     @property
     def stages(self) -> Stages:
         """q_in, the event loop and f_in, as they are at this moment."""
-        return Stages(
-            before=(
-                queue_stage("q_in", self.q_in),
-                _loop_stage(self.loop, self.failed),
-                _function_stage(
-                    "f_in",
-                    self.f_in,
-                    is_running="f_in" in _where(self._events),
-                    failure=self._failure_in("f_in"),
-                ),
-            )
-        )
-
-    def _failure_in(self, where: str) -> str:
-        """Return what f_in or f_out raised for the last event; empty if none did, or that was another event."""
-        failed_in, message, count = self._failed_last
-        return message if failed_in == where and count == self.run_count else ""
+        state: StageState = "running" if self.loop.is_running else "stopped"
+        notes = (f"{counted(self.loop.handled, 'event')}, {self.failed} failed",)
+        loop = Stage("loop", "EventLoop", state, notes)
+        return Stages(before=(queue_stage("q_in", self.q_in), loop, self._function_stage("f_in")))
 
     def emit(self, event: Any, run: Run) -> None:
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
@@ -534,7 +535,7 @@ class FullPipeline(_Answering, SinkPipeline):
     @property
     def stages(self) -> Stages:
         """q_in, the event loop, f_in, f_out and q_out, as they are at this moment."""
-        return replace(super().stages, after=self._stages_after(self._failure_in("f_out")))
+        return replace(super().stages, after=self._stages_after())
 
 
 def event_id(event: Any) -> str:
@@ -565,11 +566,6 @@ class _Attempts:
             return count
 
 
-def _where(events: Mapping[int, EventView]) -> list[str]:
-    """Return where the events under way are: one, unless several threads work on events."""
-    return [view.stage for view in tuple(events.values()) if view.stage]
-
-
 def queue_stage(name: str, queue: Any, *, is_waited_for: bool = False) -> Stage:
     """Look at a queue, which may be any object.
 
@@ -578,26 +574,24 @@ def queue_stage(name: str, queue: Any, *, is_waited_for: bool = False) -> Stage:
     is_waited_for
         Whether an answer waits to be put on it.
     """
-    size, limit = _qsize(queue), _limit(queue)
-    notes = [f"{type(queue).__name__} {queue.policy}" if isinstance(queue, Mailbox) else type(queue).__name__]
+    kind, is_mailbox = type(queue).__name__, isinstance(queue, Mailbox)
+    size, limit = _number(queue, "qsize"), _number(queue, "size" if is_mailbox else "maxsize")
+    notes = [f"{kind} {queue.policy}" if is_mailbox else kind]
     if size is not None:
-        notes.append(f"{size} of {limit} waiting" if limit else f"{size} waiting")
-    if isinstance(queue, Mailbox):
-        notes += _dropped(queue.dropped)
+        notes.append(f"{size} of {limit} waiting" if limit is not None and limit > 0 else f"{size} waiting")
+    if is_mailbox:
+        # A copy, since a producer may drop for another reason meanwhile.
+        notes += [f"{count} dropped: {reason}" for reason, count in dict(queue.dropped).items()]
     return Stage("queue", name, "running" if is_waited_for else "static", tuple(notes))
 
 
-def _loop_stage(loop: EventLoop, failed: int) -> Stage:
-    """Look at an event loop, ``failed`` of whose events failed."""
-    events = counted(loop.handled, "event")
-    return Stage("loop", "EventLoop", "running" if loop.is_running else "stopped", (f"{events}, {failed} failed",))
-
-
-def _function_stage(name: str, function: Any, *, is_running: bool = False, failure: str = "") -> Stage:
-    """Look at f_in or f_out; ``failure`` is what it raised for the last event, if it did."""
-    state: StageState = "running" if is_running else "failed" if failure else "static"
-    its_own = _function_name(function)
-    return Stage("function", name, state, tuple(note for note in (its_own, failure) if note and note != name))
+def _number(queue: Any, name: str) -> int | None:
+    """Return a number that a queue has or returns; None if it does not."""
+    with contextlib.suppress(Exception):  # a multiprocessing queue has a qsize that raises on some systems
+        found = getattr(queue, name)
+        found = found() if callable(found) else found
+        return found if type(found) is int else None
+    return None
 
 
 def _function_name(function: Any) -> str:
@@ -606,24 +600,3 @@ def _function_name(function: Any) -> str:
         if isinstance(name, str):
             return name
     return type(function).__name__
-
-
-def _qsize(queue: Any) -> int | None:
-    """Return the size of a queue, if it has one that is a number."""
-    with contextlib.suppress(Exception):  # a multiprocessing queue has a qsize that raises on some systems
-        count = queue.qsize()
-        return count if type(count) is int else None
-    return None
-
-
-def _limit(queue: Any) -> int:
-    """Return how many items a queue holds; 0 if there is no limit, or none is known."""
-    with contextlib.suppress(Exception):
-        limit = queue.size if isinstance(queue, Mailbox) else queue.maxsize
-        return limit if type(limit) is int and limit > 0 else 0
-    return 0
-
-
-def _dropped(dropped: Mapping[str, int]) -> list[str]:
-    # A copy, since a producer may drop for another reason meanwhile.
-    return [f"{count} dropped: {reason}" for reason, count in dict(dropped).items()]

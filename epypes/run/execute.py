@@ -11,9 +11,10 @@ import heapq
 import sys
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextvars import copy_context
-from math import inf
+from functools import partial
+from graphlib import TopologicalSorter
 from sys import getrefcount
 from time import perf_counter_ns
 from types import BuiltinFunctionType
@@ -36,9 +37,11 @@ from epypes.run.program import Program, Step
 from epypes.run.staleness import TokenManager, is_unchanged
 from epypes.run.timing import longest_path_ns
 
-# Runs its steps on values by slot and dirty flags by step (None from scratch), and writes nanoseconds by step. The step
-# that is running is an attribute of its first argument.
-CompiledRun = Callable[[Any, list[Any], bytearray | None, dict[int, int]], None]
+# Runs steps, and writes nanoseconds by step. What a step raises is raised; it is the step ``tokens.running``.
+Way = Callable[[TokenManager], None]
+
+# Tokens whose values hold no arrays, wanted steps, steps that were dirty before, and changed source tokens.
+Key = tuple[frozenset[str], bytes | None, bytes | None, tuple[str, ...]]
 
 # Compiling takes some 40 us per function, once: worth it for what is repeated, and a pause below 20 ms.
 RUNS_BEFORE: Final = 3
@@ -54,7 +57,7 @@ LOOK_AGAIN_AFTER: Final = 100
 
 
 class Executor:
-    """Runs the steps of a program.
+    """Chooses the way in which the steps of a program are run.
 
     Parameters
     ----------
@@ -62,108 +65,57 @@ class Executor:
         What is run.
     workers
         How many steps may run at once.
+
+    Attributes
+    ----------
+    ways
+        Those that are known.
     """
 
     def __init__(self, program: Program, workers: int) -> None:
         self._program, self._workers = program, workers
-        self._counts: Counter[Hashable] = Counter()
-        # By plain tokens, wanted steps, steps that were dirty before, and changed source tokens.
-        self.repeated: dict[Hashable, CompiledRun] = {}
+        self._counts: Counter[Key] = Counter()
+        self._compiled: dict[Key, Way] = {}
         # Types of values by slot, as the last run had them that was not compiled.
         self._kinds: list[type] = []
         # Checked for changes to their inputs, functions that share one run one after another.
-        self.may_use_threads = workers > 1 and not program.check_mutation and has_independent_steps(program)
-        # Threads can gain nothing in a run that takes less.
-        self.short_ns = _MIN_GAIN_NS if self.may_use_threads else inf
-        self._gains: dict[Hashable, Gain] = {}
+        self._may_use_threads = workers > 1 and not program.check_mutation and has_independent_steps(program)
+        self.ways = {} if self._may_use_threads else self._compiled
 
-    def execute(
-        self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int], plain: frozenset[str],
-        changed: tuple[str, ...] = (),
-    ) -> tuple[bool, BaseException | None]:  # fmt: skip
-        """Run the dirty steps, those included that become dirty on the way.
+    def way(self, key: Key, tokens: TokenManager) -> Way:
+        """Return the way to run what has such a key: the dirty steps, and those that become dirty meanwhile.
 
         Parameters
         ----------
+        key
+            What it is kept by.
         tokens
-            Are changed.
-        wanted
-            By step, 1 for those that may run; all of them for None.
-        durations_ns
-            Gets the nanoseconds of each step that ran.
-        plain
-            The tokens whose values hold no arrays in any run with these.
-        changed
-            The source tokens that have got new values, if tokens have been computed before.
-
-        Returns
-        -------
-        tuple
-            Whether threads were used; None, or what a function raised: that of the step ``tokens.running``.
+            As they are before the run.
         """
-        key = (plain, wanted, tokens.origin, changed)
-        gain = self._gain(key) if self.may_use_threads else None
-        side_by_side = gain is not None and gain.is_worth_it()
-        self._program.running.add(tokens)
-        start_ns = perf_counter_ns()
-        try:
-            if side_by_side:
-                SideBySide(tokens, wanted, durations_ns, self._workers).run()
-            elif (compiled := self._find(key, tokens, wanted, plain, changed)) is not None:
-                is_whole = True
-                try:
-                    compiled(tokens, tokens.values, tokens.dirty, durations_ns)
-                except NothingGiven:
-                    is_whole = False
-                # Outside, so that what a function raises has no context.
-                if not is_whole:
-                    go_on_one_by_one(tokens, wanted, durations_ns)
-                elif tokens.origin is None:
-                    left_out = bytes(len(tokens.dirty)) if wanted is None else wanted.translate(_INVERTED)
-                    tokens.dirty = bytearray(left_out)
-            else:
-                run_one_by_one(tokens, wanted, durations_ns)
-                if len(self._program.steps) <= _MAX_STEPS:
-                    self._kinds = self._guessed(tokens.values)
-        except BaseException as error:
-            return side_by_side, error
-        finally:
-            self._program.running.discard(tokens)
-        if gain is not None:
-            gain.learn(durations_ns, perf_counter_ns() - start_ns, side_by_side)
-        return side_by_side, None
+        if not self._may_use_threads:
+            return self._compile(key, tokens) or self._one_by_one
+        if len(self.ways) >= _MAX_COMPILED:
+            self.ways.clear()
+        self.ways[key] = way = Gain(self._program, self._workers, partial(self._in_turn, key)).run
+        return way
 
-    def _guessed(self, values: Sequence[Any]) -> list[type]:
-        """Return the types of values by slot; of one that is Nothing now, the type that it had before."""
-        kinds = [*map(type, values)]
-        if not (self._program.has_skipped and self._kinds):
-            return kinds
-        return [before if kind is NothingType else kind for before, kind in zip(self._kinds, kinds, strict=True)]
+    def _in_turn(self, key: Key, tokens: TokenManager) -> None:
+        """Run the dirty steps on this thread."""
+        (self._compiled.get(key) or self._compile(key, tokens) or self._one_by_one)(tokens)
 
-    def go_on(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> BaseException | None:
-        """Run the steps that a compiled run has not come to, which ended with NothingGiven.
+    def _one_by_one(self, tokens: TokenManager) -> None:
+        """Run the dirty steps one by one, and learn the types of the values."""
+        run_one_by_one(tokens)
+        if len(self._program.steps) <= _MAX_STEPS:
+            kinds = [*map(type, tokens.values)]
+            if self._program.has_skipped and self._kinds:
+                # Of what is Nothing now, the type that it had before.
+                pairs = zip(self._kinds, kinds, strict=True)
+                kinds = [before if kind is NothingType else kind for before, kind in pairs]
+            self._kinds = kinds
 
-        Returns
-        -------
-        BaseException or None
-            As ``execute`` does.
-        """
-        self._program.running.add(tokens)
-        try:
-            go_on_one_by_one(tokens, wanted, durations_ns)
-        except BaseException as error:
-            return error
-        finally:
-            self._program.running.discard(tokens)
-        return None
-
-    def _find(
-        self, key: Hashable, tokens: TokenManager, wanted: bytes | None, plain: frozenset[str], changed: tuple[str, ...]
-    ) -> CompiledRun | None:
+    def _compile(self, key: Key, tokens: TokenManager) -> Way | None:
         """Return the compiled run of the dirty steps; None if it has not been repeated enough."""
-        found = self.repeated.get(key)
-        if found is not None:
-            return found
         program = self._program
         if len(program.steps) > _MAX_STEPS or (program.switches and tokens.origin is not None):
             return None
@@ -172,34 +124,20 @@ class Executor:
         self._counts[key] += 1
         if self._counts[key] <= RUNS_BEFORE:
             return None
-        if len(self.repeated) >= _MAX_COMPILED:
-            self.repeated.clear()
+        if len(self._compiled) >= _MAX_COMPILED:
+            self._compiled.clear()
             self._counts.clear()
-        source = _Source(program, tokens, wanted, [program.slots[token] for token in plain], changed, self._kinds)
-        self.repeated[key] = made = source.compile()
+        self._compiled[key] = made = _Source(tokens, [program.slots[token] for token in key[0]], self._kinds).compile()
         return made
-
-    def whole(self, plain: frozenset[str]) -> CompiledRun | None:
-        """Return the compiled run of every step from scratch, if there is one that needs no look at what is wanted."""
-        is_simple = not self._program.switches and not self._program.placeholders
-        return self.repeated.get((plain, None, None, ())) if is_simple else None
-
-    def _gain(self, key: Hashable) -> Gain:
-        if len(self._gains) >= _MAX_COMPILED:
-            self._gains.clear()
-        return self._gains.setdefault(key, Gain(self._program, self._workers))
-
-
-_INVERTED: Final = bytes((1, 0)).ljust(256)
 
 
 # -- one by one -------------------------------------------------------------------------------------------------------
 
 
-def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
-    """Run the dirty steps in run order."""
-    program, values, next_dirty, store = tokens.program, tokens.values, tokens.dirty.find, tokens.store
-    steps = program.steps
+def run_one_by_one(tokens: TokenManager) -> None:
+    """Run the dirty steps that are wanted, in run order."""
+    program, values, wanted, next_dirty = tokens.program, tokens.values, tokens.wanted, tokens.begin().dirty.find
+    steps, store, durations_ns = program.steps, tokens.store, tokens.durations_ns
     # What depends on a step comes after it, so one pass over the flags finds everything.
     place = next_dirty(1)
     while place >= 0:
@@ -209,20 +147,20 @@ def run_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dic
             try:
                 made = call(program, step, values, durations_ns)
             except NothingGiven:
-                tokens.skip(step)
-            else:
-                store(step, made)
+                made = None
+            store(step, made)
         place = next_dirty(1, place + 1)
 
 
-def go_on_one_by_one(tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
-    """Run the dirty steps that a compiled run has not come to, which ended with NothingGiven."""
-    if tokens.origin is None:
-        tokens.dirty = bytearray(place not in durations_ns for place in range(len(tokens.dirty)))
-    else:
-        # What was new to any step is not known: a compiled run does not write it down.
-        tokens.origin = b"\1" * len(tokens.dirty)
-    run_one_by_one(tokens, wanted, durations_ns)
+def go_on_one_by_one(tokens: TokenManager) -> None:
+    """Run the dirty steps that a compiled run has not come to, which was given Nothing."""
+    durations_ns = tokens.durations_ns
+    tokens.dirty = bytes(left and at not in durations_ns for at, left in enumerate(tokens.dirty))
+    # What was new to any step is not known: a compiled run does not write it down.
+    tokens.changed = ()
+    if tokens.origin is not None:
+        tokens.origin = tokens.program.all_steps
+    run_one_by_one(tokens)
 
 
 # -- compiled ---------------------------------------------------------------------------------------------------------
@@ -240,6 +178,7 @@ _NAMES: Final = {
     "call": call,
     "unpack": unpack,
     "is_unchanged": is_unchanged,
+    "go_on": go_on_one_by_one,
     "Nothing": Nothing,
     "NothingGiven": NothingGiven,
 }
@@ -257,58 +196,60 @@ class _Source:
 
     Parameters
     ----------
-    program
-        What is run.
     tokens
         As they are before the run.
-    wanted
-        By step, 1 for those that may run; all of them for None.
     plain
         The slots of hyperparameters that hold no arrays.
-    changed
-        The source tokens that have got new values.
     kinds
         A guess of the types by slot; empty if there is none.
     """
 
-    def __init__(
-        self, program: Program, tokens: TokenManager, wanted: bytes | None, plain: Collection[int],
-        changed: Collection[str], kinds: Sequence[type],
-    ) -> None:  # fmt: skip
-        self._program, self._plain, self._is_first = program, frozenset(plain), tokens.origin is None
+    def __init__(self, tokens: TokenManager, plain: Collection[int], kinds: Sequence[type]) -> None:
+        self._program = program = tokens.program
+        self._plain, self._is_first = frozenset(plain), tokens.origin is None
         self._array, self._kinds = array_type(), kinds
-        self._certain = bytes(tokens.dirty)
+        self._certain = bytes(tokens.begin().dirty)
         self._carried = tokens.origin or b""
-        self._changed = {program.slots[token] for token in changed}
-        self._marked = sorted({place for slot in self._changed for place in program.consumers[slot]})
-        stale = program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), ())
+        self._changed = {program.slots[token] for token in tokens.changed}
+        wanted = tokens.wanted
+        stale = program.downstream((place for place, dirty in enumerate(self._certain) if dirty), ())
         self._steps = [program.steps[place] for place in sorted(stale) if wanted is None or wanted[place]]
+        # Whether what is dirty depends on what steps make; if not, or if all steps run, it is known what is left.
+        self._has_flags = not all(self._certain[place] for place in stale)
+        self._is_known = wanted is None or not self._has_flags
+        places = {step.place for step in self._steps}
+        self._left = bytes(dirty and place not in places for place, dirty in enumerate(self._certain))
         # Slots of which the source knows whether they are new, and those of which it knows whether their values, made
         # in this run, are long tuples without arrays.
         self._known: set[int] = set()
         self._made: set[int] = set()
 
-    def compile(self) -> CompiledRun:
+    def compile(self) -> Way:
         """Return the function that runs the steps."""
         lines = [
-            f"def make(program, steps, {', '.join(_NAMES)}, array):",
+            f"def make(program, steps, {', '.join(_NAMES)}, array, dirty, left):",
             *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
             # As arguments they stand side by side in the frame: each variable of ``make`` is an object of its own.
-            f"    def run(t, v, D, d, {', '.join(f'{name}={name}' for name in _FREQUENT)}):",
-            *(f"        D[{place}] = 1" for place in self._marked),
-            "        start = 0",
+            f"    def run(t, {', '.join(f'{name}={name}' for name in _FREQUENT)}):",
+            "        start = 0; v = t.values; d = t.durations_ns",
+            "        D = t.dirty = bytearray(dirty)" if self._has_flags else "        t.dirty = dirty",
             "        try:",
             *(f"            {line}" for line in self._lend_sources()),
             *(f"            {line}" for step in self._steps for line in self._step(step)),
-            "            pass",
+            "            t.dirty = left" if self._is_known else "            pass",
+            "            return",
+            "        except NothingGiven: pass",
             "        except BaseException:",
             "            if start: d[t.running] = clock() - start",
             "            raise",
+            "        go_on(t)",
             "    return run",
         ]
         names: dict[str, Any] = {}
         exec(compile("\n".join(lines), "<epypes: a compiled run>", "exec"), names)  # noqa: S102 - numbers only
-        run: CompiledRun = names["make"](self._program, self._program.steps, *_NAMES.values(), self._array)
+        run: Way = names["make"](
+            self._program, self._program.steps, *_NAMES.values(), self._array, self._certain, self._left
+        )
         return run
 
     def _lend_sources(self) -> Iterator[str]:
@@ -340,11 +281,12 @@ class _Source:
                     f"c{slot} = not is_unchanged(v[{slot}], m{place}, ({self._given(step)}), program.guard)",
                     f"if c{slot}:",
                     f"    v[{slot}] = m{place}",
-                    f"    {' = '.join(f'D[{reader}]' for reader in self._program.consumers[slot])} = 1",
                 ]
+                if self._has_flags:
+                    lines.append(f"    {' = '.join(f'D[{reader}]' for reader in self._program.consumers[slot])} = 1")
             else:
                 lines.append(f"v[{slot}] = m{place}")
-        if not self._is_first:
+        if self._has_flags:
             lines.append(f"D[{step.place}] = 0")
         if not self._certain[step.place]:
             yield from (f"c{slot} = False" for slot in checked)
@@ -483,9 +425,10 @@ class SideBySide:
     daemons: the interpreter exits while a function never returns.
     """
 
-    def __init__(self, tokens: TokenManager, wanted: bytes | None, durations_ns: dict[int, int], workers: int) -> None:
-        program, values = tokens.program, tokens.values
-        self._tokens, self._durations_ns, self._workers = tokens, durations_ns, workers
+    def __init__(self, tokens: TokenManager, workers: int) -> None:
+        program, values, wanted = tokens.program, tokens.values, tokens.wanted
+        tokens.begin().side_by_side = True
+        self._tokens, self._durations_ns, self._workers = tokens, tokens.durations_ns, workers
         self._before = values.copy(), tokens.dirty.copy()
         # What each step has made; None if it was skipped.
         self._made: dict[int, Sequence[Any] | None] = {}
@@ -495,20 +438,22 @@ class SideBySide:
         self._changed = threading.Condition()
         stale = program.downstream((place for place, dirty in enumerate(tokens.dirty) if dirty), values)
         steps = {place for place in stale if wanted is None or wanted[place]}
-        self._waits_for = {
-            place: steps.intersection(program.makers[slot] for slot in program.read_by(program.steps[place], values))
-            for place in steps
-        }
-        self._followers: dict[int, list[int]] = {place: [] for place in steps}
-        for place, makers in self._waits_for.items():
-            for maker in makers:
-                self._followers[maker].append(place)
-        self._ready = sorted(place for place in steps if not self._waits_for[place])
+        self._count = len(steps)
+        self._sorter = TopologicalSorter(
+            {
+                place: steps.intersection(
+                    program.makers[slot] for slot in program.read_by(program.steps[place], values)
+                )
+                for place in steps
+            }
+        )
+        self._sorter.prepare()
+        self._ready = sorted(self._sorter.get_ready())
 
     def run(self) -> None:
         """Run all steps; raise what the first failed one in run order has raised."""
         tokens = self._tokens
-        for _ in range(min(self._workers, len(self._waits_for)) - 1):
+        for _ in range(min(self._workers, self._count) - 1):
             # numpy's errstate, for one, belongs to the context.
             threading.Thread(target=copy_context().run, args=(self._work,), name="epypes worker", daemon=True).start()
         try:
@@ -525,8 +470,6 @@ class SideBySide:
                 step = tokens.program.steps[place]
                 if place > failed_at:
                     self._durations_ns.pop(place, None)
-                elif made is None:
-                    tokens.skip(step)
                 else:
                     tokens.store(step, made)
             for place in self._failures:
@@ -570,10 +513,7 @@ class SideBySide:
         self._calls.discard(place)
         if failure is None:
             self._made[place] = made
-            if made is None:
-                tokens.skip(step)
-            else:
-                tokens.store(step, made)
+            tokens.store(step, made)
             self._release(place)
         else:
             self._failures[place] = failure
@@ -586,15 +526,12 @@ class SideBySide:
         """Make ready what waited for a step alone; what is up to date after all is passed over."""
         passed = [done]
         while passed:
-            done = passed.pop()
-            for place in self._followers[done]:
-                self._waits_for[place].discard(done)
-                if self._waits_for[place]:
-                    continue
+            self._sorter.done(*passed)
+            ready = self._sorter.get_ready()
+            passed = [place for place in ready if not self._tokens.dirty[place]]
+            for place in ready:
                 if self._tokens.dirty[place]:
                     heapq.heappush(self._ready, place)
-                else:
-                    passed.append(place)
 
 
 class _Call:
@@ -612,12 +549,21 @@ class Gain:
     is something to be gained at best, and from then on the faster way is taken. Now and then the other is tried again.
     """
 
-    def __init__(self, program: Program, workers: int) -> None:
-        self._program, self._workers = program, workers
+    def __init__(self, program: Program, workers: int, in_turn: Way) -> None:
+        self._program, self._workers, self._in_turn = program, workers, in_turn
         self._one_by_one_ns: deque[int] = deque(maxlen=_TRIALS)
         self._side_by_side_ns: deque[int] = deque(maxlen=_TRIALS)
         self._is_promising = False
         self._asked = 0
+
+    def run(self, tokens: TokenManager) -> None:
+        """Run the steps in the way that seems to be the faster one."""
+        start_ns, side_by_side = perf_counter_ns(), self.is_worth_it()
+        if side_by_side:
+            SideBySide(tokens, self._workers).run()
+        else:
+            self._in_turn(tokens)
+        self.learn(tokens.durations_ns, perf_counter_ns() - start_ns, side_by_side)
 
     def is_worth_it(self) -> bool:
         """Whether the next run should go side by side."""

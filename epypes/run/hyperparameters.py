@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from epypes.errors import HyperparameterError, PayloadError, UnknownName
-from epypes.run.guard import ARRAYLESS, keep, require_reusable
+from epypes.run.guard import ARRAYLESS, COPIERS, keep, require_reusable
 from epypes.run.program import Program
-from epypes.run.staleness import NOT_COMPUTED, is_same_value
-
-if TYPE_CHECKING:
-    from epypes.run.execute import CompiledRun
+from epypes.run.staleness import NOT_COMPUTED, TokenManager, is_same_value, new_tokens
 
 
 class Hyperparameters:
@@ -32,12 +29,12 @@ class Hyperparameters:
         That revision; -1 if other tokens were hyperparameters in it.
     plain
         The tokens whose values are numbers, texts or None: they hold no arrays, so functions get them as they are.
-    repeated
-        The compiled run of every step with these plain tokens, ``base`` and ``free_slots``, once there is one.
     """
 
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    __slots__ = ("_base", "_free_slots", "changed", "entries", "follows", "plain", "program", "repeated", "revision")
+    changed: Mapping[str, Any] = MappingProxyType({})
+    follows = -1
+    _start: tuple[list[Any], dict[str, int]] | None = None
 
     def __init__(
         self,
@@ -46,15 +43,7 @@ class Hyperparameters:
         revision: int = 0,
         plain: frozenset[str] = frozenset(),
     ) -> None:
-        self.program = program
-        self.entries = entries
-        self.revision = revision
-        self.changed: Mapping[str, Any] = {}
-        self.follows = -1
-        self.plain = plain
-        self.repeated: tuple[CompiledRun, list[Any], dict[str, int]] | None = None
-        self._base: list[Any] | None = None
-        self._free_slots: dict[str, int] | None = None
+        self.program, self.entries, self.revision, self.plain = program, entries, revision, plain
 
     @property
     def values(self) -> Mapping[str, Any]:
@@ -69,22 +58,20 @@ class Hyperparameters:
     @property
     def free_slots(self) -> dict[str, int]:
         """The slots of the source tokens that are neither frozen nor delayed, by first appearance in func_io."""
-        if self._free_slots is None:
-            slots, sources = self.program.slots, self.program.cg.source_tokens
-            taken = {**self.entries, **self.program.cg.delays}
-            self._free_slots = {token: slots[token] for token in sources if token not in taken}
-        return self._free_slots
+        return (self._start or self._started())[1]
 
-    @property
-    def base(self) -> list[Any]:
-        """The values by slot, with which a run begins."""
-        if self._base is None:
-            base: list[Any] = [NOT_COMPUTED] * len(self.program.tokens)
-            for token, entry in self.entries.items():
-                base[self.program.slots[token]] = entry[0]
-            # Only when it is complete: other threads read it without a lock.
-            self._base = base
-        return self._base
+    def _started(self) -> tuple[list[Any], dict[str, int]]:
+        """Return the values by slot with which a run begins, and the free slots."""
+        slots, cg = self.program.slots, self.program.cg
+        base: list[Any] = [NOT_COMPUTED] * len(self.program.tokens)
+        for token, entry in self.entries.items():
+            base[slots[token]] = entry[0]
+        free = {
+            token: slots[token] for token in cg.source_tokens if token not in self.entries and token not in cg.delays
+        }
+        # Only when it is complete: other threads read it without a lock.
+        self._start = base, free
+        return self._start
 
     def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
         """Return these with tokens given values; all or nothing. An equal value changes nothing.
@@ -126,10 +113,9 @@ class Hyperparameters:
             entries[token] = (value, value if entry is None else entry[1])
         if not new:
             return self
-        made = _new_hyperparameters()  # a slider makes some at each move: half the time of Hyperparameters(...)
-        made.program, made.entries, made.revision = program, entries, revision + 1
-        made.changed, made.follows, made.plain = new, follows, plain
-        made.repeated = made._base = made._free_slots = None
+        made = _new_hyperparameters()
+        made.program, made.entries, made.revision, made.plain = program, entries, revision + 1, plain
+        made.changed, made.follows = new, follows
         return made
 
     def unfrozen(self, token: str) -> Hyperparameters:
@@ -138,8 +124,8 @@ class Hyperparameters:
         entries = {name: entry for name, entry in self.entries.items() if name != token}
         return Hyperparameters(self.program, entries, self.revision + 1, self.plain - {token})
 
-    def with_payload(self, payload: Mapping[str, Any]) -> list[Any]:
-        """Return the values by slot with which a run on a payload begins.
+    def tokens(self, payload: Mapping[str, Any], state: Sequence[Any]) -> TokenManager:
+        """Return the tokens of a run from scratch on a payload and a state, before its first step.
 
         Raises
         ------
@@ -148,16 +134,21 @@ class Hyperparameters:
         IteratorRefused
             A value can be read only once.
         """
-        values, free = self.base.copy(), self.free_slots
+        program, (base, free) = self.program, self._start or self._started()
+        values = base.copy()
         for token, value in payload.items():
             slot = free.get(token)
             if slot is None:
                 raise self._wrong_payload(token)
             values[slot] = value
-            require_reusable(value, self.program, slot)
-        if self.program.selectors:
+            if type(value) not in COPIERS:
+                require_reusable(value, program, slot)
+        if program.selectors:
             self.require_branches(payload)
-        return values
+        if program.states:
+            for slots, value in zip(program.states, state, strict=True):
+                values[slots.before] = value
+        return new_tokens().fill(program, values, program.all_steps, len(payload) == len(free), None)
 
     def changes_since(self, earlier: Hyperparameters) -> Mapping[str, Any]:
         """Return the tokens that have another version than in an earlier or later revision, with their values."""
@@ -215,4 +206,5 @@ def _is_delayed(token: str, of: str) -> str:
     return f"Token {token!r} is the previous value of {of!r}. Set it by runner.state = {{{token!r}: ...}}."
 
 
+# Half the time of Hyperparameters(...).
 _new_hyperparameters: Final[Callable[[], Hyperparameters]] = partial(object.__new__, Hyperparameters)

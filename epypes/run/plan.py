@@ -15,7 +15,7 @@ from typing import Any
 
 from epypes.errors import PayloadError, PlaceholderNeeded, UnknownName, run_call
 from epypes.graph import CompGraph
-from epypes.rich_display import mimebundle, to_text
+from epypes.rich_display import Displayed
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, TokenManager
@@ -23,7 +23,7 @@ from epypes.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(Displayed):
     """What a run of ``targets`` would do; shows itself as a table and on the graph.
 
     Attributes
@@ -69,12 +69,6 @@ class Plan:
         missing = f", {len(self.missing) + len(self.placeholders)} missing" * bool(self.missing or self.placeholders)
         count = len(self.order)
         return f"<Plan: {counted(count, 'function')} to run, {len(self.reused)} reused{missing}>"
-
-    def __str__(self) -> str:
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return mimebundle(self)
 
 
 def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str], hparams: Hyperparameters) -> Plan:

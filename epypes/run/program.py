@@ -25,6 +25,8 @@ REVISION: Final = "__epypes_revision__"
 # What a function has that measures its calls: where it is true, a program calls its ``func`` in its place, and has it
 # count the call when the run has ended.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
+# A thousand reports of more steps would hold a gigabyte of integers.
+_MOST_UNPACKED: Final = 400
 MAX_UNCOUNTED: Final = 100
 # What a function has that keeps state between its calls: by key, the state before the first call; and a method that
 # takes a state and inputs, and returns the value and the state after.
@@ -115,8 +117,12 @@ class Program:
         The steps that are one.
     nodes
         The steps that have a node, with it.
-    clean
-        The dirty flags of a run in which every step is up to date.
+    is_large
+        Whether the times of its runs are packed.
+    all_steps, no_steps
+        A flag for each step, which is set; which is not set.
+    is_conditional
+        Whether it is to be seen before each run which steps are needed, and can be run: switches, placeholders.
     uncounted
         Of runs that have ended, nanoseconds by step, for nodes to count; None if there are no nodes.
     running
@@ -149,10 +155,12 @@ class Program:
             node.programs.append(ref(self, node.programs.remove))
         self.running: set[Any] = set()
         self.has_skipped = False
-        self.clean = bytes(len(steps))
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
+        self.is_large = len(steps) > _MOST_UNPACKED
+        self.all_steps, self.no_steps = b"\1" * len(steps), bytes(len(steps))
+        self.is_conditional = bool(self.switches or self.placeholders)
         found: dict[int, tuple[object, ...]] = {
             key: objects
             for key, function in distinct(cg.functions).items()
@@ -200,11 +208,6 @@ class Program:
                     )
                     raise GraphError([Finding("delay", text, (name,))])
 
-    def begin(self, values: list[Any], state: Sequence[Any]) -> None:
-        """Write a state into the values by slot with which a run begins."""
-        for slots, value in zip(self.states, state, strict=True):
-            values[slots.before] = value
-
     def revisions(self, around: tuple[Program, ...] = ()) -> tuple[Any, ...]:
         """Return the present revisions of the functions that have one.
 
@@ -234,10 +237,9 @@ class Program:
         places = {getattr(each, "running", -1) for each in tuple(self.running)}
         return tuple(self.steps[place].name for place in sorted(places) if place >= 0)
 
-    def note_calls(self, durations_ns: Mapping[int, int]) -> None:
-        """Take note of the calls of nodes in a run that has ended."""
-        if self.uncounted is not None:
-            self.uncounted.append(durations_ns)
+    def __del__(self) -> None:
+        # What its last runs have called; nothing if it could not be made.
+        if getattr(self, "uncounted", None):
             self.count_calls()
 
     def count_calls(self) -> None:
@@ -350,10 +352,14 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
     switches = {name: as_switch(cg.functions[name]) for name in cg.switches}
     sides = zip(cg.digraph.inputs.values(), cg.digraph.outputs.values(), cg.func_io.values(), strict=True)
     for place, ((name, function), (inputs, outputs, io)) in enumerate(zip(cg.functions.items(), sides, strict=True)):
-        function = called_for(name, function)
-        unguarded, switch, contract = is_unguarded(function), switches.get(name), contracts.get(name)
-        in_out = in_out_places(function, len(inputs))
-        has_node = hasattr(type(function), IS_ITS_FUNC) and getattr(function, IS_ITS_FUNC)
+        switch, contract = switches.get(name), contracts.get(name)
+        unguarded, has_node = False, False
+        in_out: tuple[int, ...] = ()
+        # Of large graphs most functions are made by def alone.
+        if type(function) is not FunctionType or function.__dict__:
+            function = called_for(name, function)
+            unguarded, in_out = is_unguarded(function), in_out_places(function, len(inputs))
+            has_node = hasattr(type(function), IS_ITS_FUNC) and getattr(function, IS_ITS_FUNC)
         yield _new_step((
             place,
             name,

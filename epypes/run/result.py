@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     from weakref import ref
 
 
-# Values by slot, dirty flags by step, whether every source token has a value, the revisions of nested pipelines, the
-# hyperparameters with their versions, times, failure.
-Record = tuple[list[Any], bytes, bool, tuple[Any, ...], Hyperparameters, Times, Failure | None]
-
 # The state of a runner when a trial began: the runner's key, its hyperparameters, its last run, and what the next run
 # would have begun with. The last run is not kept alive, since a run's memory is that of its images.
 TrialOf = tuple[object, Hyperparameters, "ref[Run] | None", tuple[Any, ...]]
@@ -55,41 +51,51 @@ class Run(TokenMapping):
     Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
     draw on a copy, ``run["edges"].copy()``. A payload array is not copied: if its owner fills it again, the run and its
     picture show what is in it then.
+
+    Attributes
+    ----------
+    tokens
+        The token store.
+    hparams
+        The hyperparameters with their versions.
+    times
+        What ``report`` is made of.
+    trial_of
+        Of a trial, the state of its runner when it began.
     """
 
-    # While it runs, ``running`` is its step. Then one tuple is set, and nothing else: what is made of it is made when
-    # it is read, since to record a run takes a good part of what EPypes adds to its functions.
-    __slots__ = ("__weakref__", "_tokens", "record", "running", "trial_of")
-    running: int
+    # What can be made of these is made when it is read: to record a run takes a good part of what EPypes adds to its
+    # functions.
+    __slots__ = ("__weakref__", "_failure", "hparams", "times", "tokens", "trial_of")
     trial_of: TrialOf
 
-    def __init__(self, record: Record) -> None:
-        self.record = record
+    def __init__(self, tokens: TokenManager, hparams: Hyperparameters, times: Times, failure: Failure | None) -> None:
+        self.tokens, self.hparams, self.times, self._failure = tokens, hparams, times, failure
 
     @property
     def report(self) -> RunReport:
         """The times of the run."""
-        return RunReport(*self.record[5])
+        return RunReport(*self.times)
 
     @property
     def failure(self) -> Failure | None:
         """None, or the function that failed; the tokens that were computed before keep their values."""
-        return self.record[6]
+        return self._failure
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
         """The values that the run was computed with."""
-        return self.record[4].values
+        return self.hparams.values
 
     @property
     def first_hyperparameters(self) -> Mapping[str, Any]:
         """The values that they had when they were made or frozen, by token."""
-        return self.record[4].first_values
+        return self.hparams.first_values
 
     @property
     def revision(self) -> int:
         """The runner's count of hyperparameter changes when the run began."""
-        return self.record[4].revision
+        return self.hparams.revision
 
     @property
     def state(self) -> Mapping[str, Any]:
@@ -97,18 +103,17 @@ class Run(TokenMapping):
 
         Of a failed run, and where nothing was found, it is what the run began with.
         """
-        return readable_state(self.record[4].program, self.state_after())
+        return readable_state(self.tokens.program, self.state_after())
 
     @property
     def state_before(self) -> Mapping[str, Any]:
         """What the run began with, by delayed token; ``runner.trial`` takes it to repeat the run on its payload."""
-        values, program = self.record[0], self.record[4].program
+        values, program = self.tokens.values, self.tokens.program
         return readable_state(program, [values[slots.before] for slots in program.states])
 
     def state_after(self) -> tuple[Any, ...]:
         """Return the values of ``state`` as they are stored, in the order of the program's states."""
-        values, *_, hparams, times, failure = self.record
-        program, wanted = hparams.program, times[1]
+        values, program, wanted, failure = self.tokens.values, self.tokens.program, self.times[1], self._failure
         needed = wanted_steps(program, values, ()) if program.switches else None
 
         def value_after(slots: StateSlots) -> Any:
@@ -124,29 +129,18 @@ class Run(TokenMapping):
     @property
     def cg(self) -> CompGraph:
         """The graph that was run."""
-        return self.record[4].program.cg
-
-    @property
-    def tokens(self) -> TokenManager:
-        """The token store."""
-        try:
-            return self._tokens
-        except AttributeError:
-            values, dirty, has_payload, revisions, hparams, _, _ = self.record
-            self._tokens: TokenManager = TokenManager.of_run(
-                hparams.program, values, bytearray(dirty), has_payload, revisions
-            )
-            return self._tokens
+        return self.tokens.program.cg
 
     def __getitem__(self, token: str) -> Any:
-        values, dirty, has_payload, _, hparams, _, _ = self.record
+        tokens = self.tokens
+        program = tokens.program
         # Of a run that is whole every token has a value, and none is out of date.
-        slot = hparams.program.slots.get(token)
-        if slot is not None and has_payload and 1 not in dirty:
-            value = values[slot]
-            return value if type(value) in READ_AS_STORED or not hparams.program.guard else lend(value)
+        slot = program.slots.get(token)
+        if slot is not None and tokens.has_payload and 1 not in tokens.dirty:
+            value = tokens.values[slot]
+            return value if type(value) in READ_AS_STORED or not program.guard else lend(value)
         try:
-            return self.tokens.read(token)
+            return tokens.read(token)
         except StaleToken:
             raise
         except NotComputed as error:
@@ -170,6 +164,10 @@ def readable_state(program: Program, values: Sequence[Any]) -> Mapping[str, Any]
     """Return values in the order of the program's states as the user reads them, by key; those that are there."""
     known = {slots.key: value for slots, value in zip(program.states, values, strict=True) if value is not NOT_COMPUTED}
     return MappingProxyType({key: lend_to_reader(value) if program.guard else value for key, value in known.items()})
+
+
+# Half the time of Run(...).
+new_run: Final[Callable[[], Run]] = partial(object.__new__, Run)
 
 
 class RunImporter:
@@ -213,19 +211,21 @@ class RunImporter:
             Of the function that failed, if one did.
         """
         program, first = self._program, first_hyperparameters or {}
-        slots: list[Any] = [NOT_COMPUTED] * len(program.tokens)
-        for token, value in {**tokens, **hyperparameters}.items():
-            if token in program.slots:
-                slots[program.slots[token]] = value
-        entries = {token: (value, first.get(token, value)) for token, value in hyperparameters.items()}
-        # No function is out of date; but not every token has a value, so the run must not be taken for a whole one.
-        known = durations_ns or {}
-        by_step = {step.place: known[step.name] for step in program.steps if step.name in known}
-        failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
-        skipped = tuple(self._skip(slots, by_step))
-        times = (program, None, by_step, total_ns, False, failed_at, skipped)
+        known = [(token, value) for token, value in hyperparameters.items() if token in program.slots]
+        entries = {token: (value, first.get(token, value)) for token, value in known}
         hparams = Hyperparameters(program, entries, revision)
-        return Run((slots, program.clean, False, program.revisions(), hparams, times, failure))
+        stored = hparams.tokens({}, [NOT_COMPUTED] * len(program.states))
+        # No function is out of date; but not every token has a value, so the run must not be taken for a whole one.
+        stored.dirty, stored.has_payload = program.no_steps, False
+        for token, value in tokens.items():
+            if token in program.slots and token not in entries:
+                stored.values[program.slots[token]] = value
+        durations_ns = durations_ns or {}
+        by_step = {step.place: durations_ns[step.name] for step in program.steps if step.name in durations_ns}
+        failed_at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
+        skipped = tuple(self._skip(stored.values, by_step))
+        times = (program, None, by_step, total_ns, False, failed_at, skipped)
+        return Run(stored, hparams, times, failure)
 
     def _skip(self, slots: list[Any], ran: Container[int]) -> Iterator[int]:
         """Give the steps that were skipped, as far as the tokens say, whose outputs become Nothing."""
@@ -237,7 +237,3 @@ class RunImporter:
                 for slot in step.outputs:
                     slots[slot] = Nothing
                 yield step.place
-
-
-# Half the time of Run(...).
-new_run: Final[Callable[[], Run]] = partial(object.__new__, Run)

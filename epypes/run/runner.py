@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from time import perf_counter_ns
 from typing import Any, Final
@@ -14,23 +13,21 @@ from weakref import ref
 from epypes.deprecation import OldNames, takes_old_keywords
 from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, require_mapping, run_call
 from epypes.graph import CompGraph, redefined
-from epypes.nothing import NothingGiven
-from epypes.run.execute import CompiledRun, Executor
-from epypes.run.failure import failure_of
-from epypes.run.guard import COPIERS, keep, lend_to_reader, require_reusable
+from epypes.run.execute import Executor, Way
+from epypes.run.failure import Failure, failure_of
+from epypes.run.guard import keep, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
 from epypes.run.result import Run, TokenMapping, TrialOf, new_run, readable_state
-from epypes.run.staleness import TokenManager, skipped_steps
-from epypes.run.timing import Reports
+from epypes.run.staleness import NOT_COMPUTED, TokenManager, skipped_steps
+from epypes.run.timing import Reports, packed
 from epypes.wording import counted
 
 Payload = Mapping[str, Any]
 
 _LOG: Final = logging.getLogger(__name__)
 _MAX_TARGETS: Final = 64
-_NO_SERIES: Final = nullcontext()
 
 
 class CompGraphRunner(OldNames, TokenMapping):
@@ -100,6 +97,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         self.check_mutation = check_mutation
         self._program = Program(cg, guard, check_mutation)
         self._executor = Executor(self._program, workers)
+        self._ways = self._executor.ways
         # The steps that targets need, where no switch has a say in it.
         self._wanted: dict[tuple[str, ...], bytes] = {}
         self._own_state()
@@ -159,47 +157,13 @@ class CompGraphRunner(OldNames, TokenMapping):
     def run_on(self, payload: Payload, targets: Sequence[str] = ()) -> Run:
         """Do what ``run`` does, with the payload as a mapping by free source token."""
         start_ns = perf_counter_ns()
-        hparams, program = self._hparams, self._program
-        repeated = hparams.repeated
-        if repeated is None or targets or program.states or len(payload) != len(repeated[2]):
-            with self._series if program.states else _NO_SERIES:
-                return self._run_from_scratch(hparams, payload, targets, start_ns, None)
-        # A stream of images goes this way: as short as can be.
-        compiled, base, slots = repeated
-        values = base.copy()
-        try:
-            for token in payload:
-                value = values[slots[token]] = payload[token]
-                if type(value) not in COPIERS:
-                    require_reusable(value, program, slots[token])
-        except KeyError:
-            return self._run_from_scratch(hparams, payload, targets, start_ns, None)
-        return self._repeat(compiled, values, None, None, hparams, start_ns, None)
-
-    def _run_from_scratch(
-        self,
-        hparams: Hyperparameters,
-        payload: Payload,
-        targets: Sequence[str],
-        start_ns: int,
-        trial_of: TrialOf | None,
-        state: Sequence[Any] | None = None,
-    ) -> Run:
-        """Run what the targets need, everything without, on a payload and a state, by default the runner's own."""
-        self._require_targets(targets)
-        tokens = self._beginning(hparams, payload, self._kept if state is None else state)
-        try:
-            return self._run(tokens, hparams, targets, payload, start_ns, trial_of)
-        finally:
-            is_short = perf_counter_ns() - start_ns < self._executor.short_ns
-            if hparams.repeated is None and is_short and (compiled := self._executor.whole(hparams.plain)) is not None:
-                hparams.repeated = compiled, hparams.base, hparams.free_slots
-
-    def _beginning(self, hparams: Hyperparameters, payload: Payload, state: Sequence[Any]) -> TokenManager:
-        """Return the tokens of a run from scratch, before its first step."""
-        values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
-        self._program.begin(values, state)
-        return TokenManager.from_scratch(self._program, values, has_payload)
+        if targets:
+            self._require_targets(targets)
+        hparams = self._hparams
+        if not self._program.states:
+            return self._run(hparams.tokens(payload, ()), hparams, targets, start_ns)
+        with self._series:
+            return self._run(hparams.tokens(payload, self._kept), hparams, targets, start_ns)
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -215,17 +179,16 @@ class CompGraphRunner(OldNames, TokenMapping):
         Exception
             Whatever a function raises, unchanged, with a note.
         """
-        if self._program.states:
-            with self._series:
-                return self._go_on(changes, targets, False)
-        return self._go_on(changes, targets, False)
+        if not self._program.states:
+            return self._go_on(changes, targets)
+        with self._series:
+            return self._go_on(changes, targets)
 
-    def _go_on(self, changes: Mapping[str, Any], targets: tuple[str, ...], is_trial: bool) -> Run:
+    def _go_on(self, changes: Mapping[str, Any], targets: tuple[str, ...], is_trial: bool = False) -> Run:
         """Change hyperparameters, and run the stale functions on the tokens of the last run."""
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
-        program = self._program
         with self._lock:
             first, last = self._hparams, self.last
             hparams = first.frozen(changes, also_new=False)
@@ -235,86 +198,58 @@ class CompGraphRunner(OldNames, TokenMapping):
             free = self.free_source_tokens
             raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first.")
         trial_of = (self._key, first, ref(last), self._kept) if is_trial else None
-        values, dirty, has_payload, _, before, _, failure = last.record
+        before = last.hparams
+        is_next = hparams.follows == before.revision
+        changes = hparams.changed if is_next else hparams.changes_since(before)
+        tokens = last.tokens.branch(changes, are_new=is_next)
         # A failure keeps this frame, with all that is named in it: the run before, which may have failed too.
-        del failure
-        if hparams.follows == before.revision and has_payload and not program.revised:
-            # A slider goes this way: as short as can be.
-            changed, wanted = hparams.changed, self._wanted.get(targets) if targets else None
-            compiled = self._executor.repeated.get((hparams.plain, wanted, dirty, (*changed,)))
-            if compiled is not None and (wanted is not None or not targets):
-                values = values.copy()
-                for token, value in changed.items():
-                    values[program.slots[token]] = value
-                del last
-                return self._repeat(compiled, values, dirty, wanted, hparams, start_ns, trial_of)
-        tokens = last.tokens.branch()
-        del last, values
-        new = tokens.change(hparams.changes_since(before))
-        return self._run(tokens, hparams, targets, (), start_ns, trial_of, new)
+        del last
+        return self._run(tokens, hparams, targets, start_ns, trial_of)
+
+    def _wanted_steps(self, tokens: TokenManager, hparams: Hyperparameters, targets: Sequence[str]) -> bytes | None:
+        """Return 1 for each step that is needed, None if all are; raise unless all of them can be run."""
+        program, values, key = self._program, tokens.values, tuple(targets)
+        wanted = self._wanted.get(key)
+        if wanted is None:
+            wanted = wanted_steps(program, values, targets)
+            if wanted is not None and not program.switches and len(self._wanted) < _MAX_TARGETS:
+                self._wanted[key] = wanted
+        if program.placeholders or not tokens.has_payload:
+            given = [token for token, slot in hparams.free_slots.items() if values[slot] is not NOT_COMPUTED]
+            check_ready(program, values, wanted, given)
+        return wanted
 
     def _run(
-        self, tokens: TokenManager, hparams: Hyperparameters, targets: Sequence[str], payload: Collection[str],
-        start_ns: int, trial_of: TrialOf | None, changed: tuple[str, ...] = (),
+        self, tokens: TokenManager, hparams: Hyperparameters, targets: Sequence[str], start_ns: int,
+        trial_of: TrialOf | None = None, way: Way | None = None,
     ) -> Run:  # fmt: skip
-        """Run the dirty steps that the targets need, all without; make the run the last one unless it is a trial."""
-        program = self._program
-        wanted = wanted_steps(program, tokens.values, targets) if targets or program.switches else None
-        if program.placeholders or not tokens.has_payload:
-            check_ready(program, tokens.values, wanted, payload)
-        if wanted is not None and not program.switches and len(self._wanted) < _MAX_TARGETS:
-            self._wanted[tuple(targets)] = wanted
-        durations_ns: dict[int, int] = {}
-        side_by_side, error = self._executor.execute(tokens, wanted, durations_ns, hparams.plain, changed)
-        return self._ended(tokens, hparams, wanted, durations_ns, start_ns, trial_of, error, side_by_side)
+        """Run the dirty steps that the targets need, all without, and record what is left.
 
-    def _ended(
-        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: dict[int, int],
-        start_ns: int, trial_of: TrialOf | None, error: BaseException | None, side_by_side: bool = False,
-    ) -> Run:  # fmt: skip
-        """Record the run that has left these tokens, and end it; ``error`` is what the running step raised."""
-        if error is not None:
-            run = self._failed_run(tokens, hparams, wanted, durations_ns, start_ns, error, side_by_side)
-        else:
-            program, skipped = self._program, skipped_steps(self._program, tokens.values, tokens.dirty)
-            times = program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, -1, skipped
-            program.note_calls(durations_ns)
-            dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
-            run = Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, None))
-        return self._end(run, trial_of)
-
-    def _repeat(
-        self, compiled: CompiledRun, values: list[Any], origin: bytes | None, wanted: bytes | None,
-        hparams: Hyperparameters, start_ns: int, trial_of: TrialOf | None,
-    ) -> Run:  # fmt: skip
-        """Do what ``_run`` does, with a compiled run; ``origin`` are the dirty steps, None from scratch."""
-        program, error = self._program, None
-        revisions = program.revisions() if program.revised else ()
-        durations_ns: dict[int, int] = {}
-        dirty = None if origin is None else bytearray(origin)
-        run = new_run()
-        program.running.add(run)
+        The run becomes the last one unless it is a trial. With a way, that is taken in place of the executor's.
+        """
+        program, failed_at, error, failure = self._program, -1, None, None
+        if way is None:
+            if targets or program.is_conditional or not tokens.has_payload:
+                tokens.wanted = self._wanted_steps(tokens, hparams, targets)
+            key = hparams.plain, tokens.wanted, tokens.origin, tokens.changed
+            way = self._ways.get(key) or self._executor.way(key, tokens)
+        durations_ns, running = tokens.durations_ns, program.running
+        running.add(tokens)
         try:
-            compiled(run, values, dirty, durations_ns)
+            way(tokens)
         except BaseException as raised:
             error = raised
         finally:
-            program.running.discard(run)
+            running.discard(tokens)
         if error is not None:
-            left = bytearray(b"\1") * len(program.steps) if dirty is None else dirty
-            tokens = TokenManager.of_run(program, values, left, True, revisions)
-            tokens.running, tokens.origin = getattr(run, "running", 0), origin
-            if isinstance(error, NothingGiven):
-                error = self._executor.go_on(tokens, wanted, durations_ns)
-            return self._ended(tokens, hparams, wanted, durations_ns, start_ns, trial_of, error)
+            failed_at = max(0, tokens.running)
+            failure = _failed(tokens, failed_at, error)
+        skipped = skipped_steps(program, tokens.values, tokens.dirty) if program.has_skipped else ()
         total_ns = perf_counter_ns() - start_ns
-        if total_ns > self._executor.short_ns:
-            hparams.repeated = None
-        # Without targets everything is up to date then.
-        left_dirty = program.clean if wanted is None or dirty is None else bytes(dirty)
-        skipped = skipped_steps(program, values, left_dirty) if program.has_skipped else ()
-        times = program, wanted, durations_ns, total_ns, False, -1, skipped
-        run.record = values, left_dirty, True, revisions, hparams, times, None
+        kept_ns = packed(program, durations_ns) if program.is_large else durations_ns
+        times = program, tokens.wanted, kept_ns, total_ns, tokens.side_by_side, failed_at, skipped
+        run = new_run()
+        run.tokens, run.hparams, run.times, run._failure = tokens, hparams, times, failure
         if (uncounted := program.uncounted) is not None:
             uncounted.append(durations_ns)
             if len(uncounted) > MAX_UNCOUNTED:
@@ -325,53 +260,14 @@ class CompGraphRunner(OldNames, TokenMapping):
         with self._lock:
             self.last = run
             if program.states:
-                self._kept = self._state_left_by(run)
+                self._kept = self._kept_after(run)
         self._keep_times(times)
         if self._watchers:
             self._tell_watchers()
-        return run
-
-    def _failed_run(
-        self, tokens: TokenManager, hparams: Hyperparameters, wanted: bytes | None, durations_ns: dict[int, int],
-        start_ns: int, error: BaseException, side_by_side: bool = False,
-    ) -> Run:  # fmt: skip
-        """Return what is left of a run in which a step raised: the step that was running."""
-        program, failed_at = self._program, max(0, tokens.running)
-        total_ns = perf_counter_ns() - start_ns
-        durations_ns.setdefault(failed_at, 0)
-        program.note_calls(durations_ns)
-        if tokens.origin is None:
-            tokens.dirty = bytearray(left and place not in durations_ns for place, left in enumerate(tokens.dirty))
-        failure = failure_of(tokens, failed_at, error)
-        tokens.forget(program.downstream([failed_at], tokens.values))
-        # Of the steps that were not reached none was reused.
-        reached = bytearray(wanted or b"\1" * len(program.steps))
-        for place in tokens.stale:
-            reached[place] = 0
-        skipped = skipped_steps(program, tokens.values, tokens.dirty)
-        times = program, bytes(reached), durations_ns, total_ns, side_by_side, failed_at, skipped
-        dirty, has_payload = bytes(tokens.dirty), tokens.has_payload
-        return Run((tokens.values, dirty, has_payload, tokens.revisions, hparams, times, failure))
-
-    def _end(self, run: Run, trial_of: TrialOf | None) -> Run:
-        """Make a run the last one unless it is a trial; raise the user's exception if a function failed.
-
-        To be called where no exception is being handled, which would become the context of the user's.
-        """
-        if trial_of is not None:
-            run.trial_of = trial_of
-            return run
-        *_, times, failure = run.record
-        with self._lock:
-            self.last = run
-            if self._program.states and failure is None:
-                self._kept = self._state_left_by(run)
-        self.reports.add(times)
-        if self._watchers:
-            self._tell_watchers()
-        if failure is not None:
+        if error is not None:
             self._failed.run = ref(run)
-            raise failure.exception
+            # Not while an exception is being handled, which would become the context of the user's.
+            raise error
         return run
 
     def failed_run(self, exception: BaseException) -> Run | None:
@@ -417,11 +313,12 @@ class CompGraphRunner(OldNames, TokenMapping):
                 raise PayloadError(self.free_source_tokens, "A trial with a state needs a payload: payload={...}.")
             return self._go_on(values, targets, True)
         start_ns = perf_counter_ns()
+        self._require_targets(targets)
         before, last = self._state
         hparams = before.frozen(values, also_new=False)
         trial_of = self._key, before, None if last is None else ref(last), self._kept
-        begin = None if state is None else self._state_of(state)
-        return self._run_from_scratch(hparams, payload, targets, start_ns, trial_of, begin)
+        begin = self._kept if state is None else self._state_of(state)
+        return self._run(hparams.tokens(payload, begin), hparams, targets, start_ns, trial_of)
 
     def adopt(self, run: Run, /) -> bool:
         """Make a run of ``trial`` the last one and its hyperparameters the runner's, in one step.
@@ -436,14 +333,12 @@ class CompGraphRunner(OldNames, TokenMapping):
         key, before, last, kept = getattr(run, "trial_of", (None,) * 4)
         if key is not self._key:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
-        with self._series if self._program.states else _NO_SERIES, self._lock:
+        with self._series, self._lock:
             is_as_it_was = before is self._hparams and (None if last is None else last()) is self.last
             if not is_as_it_was or kept is not self._kept:
                 return False
-            self._hparams, self.last = run.record[4], run
-            if self._program.states and run.failure is None:
-                self._kept = self._state_left_by(run)
-        self.reports.add(run.record[5])
+            self._hparams, self.last, self._kept = run.hparams, run, self._kept_after(run)
+        self._keep_times(run.times)
         self._tell_watchers()
         return True
 
@@ -474,12 +369,14 @@ class CompGraphRunner(OldNames, TokenMapping):
         """Return what ``rerun(*targets)`` would do, and why."""
         self._require_targets(targets)
         hparams, last = self._state
-        changed = () if last is None else tuple(hparams.changes_since(last.record[4]))
+        changed = () if last is None else tuple(hparams.changes_since(last.hparams))
         return plan(self._tokens_now(hparams, last), targets, changed, hparams)
 
     def _require_targets(self, targets: Sequence[object]) -> None:
         """Raise unless all of these are names of tokens."""
         for token in targets:
+            if type(token) is str and token in self._program.slots:
+                continue
             if not isinstance(token, str):
                 kind, free = type(token).__name__, self.free_source_tokens
                 text = f"A target is the name of a token, not {kind!r}. Payload goes by name: {run_call(free)}."
@@ -548,28 +445,42 @@ class CompGraphRunner(OldNames, TokenMapping):
 
     @state.setter
     def state(self, values: Mapping[str, Any]) -> None:
-        kept = self._state_of(values)
+        self._begin_with(self._state_of(values))
+
+    def reset(self) -> None:
+        """Have the next run begin with the initial state; the last run stays, and ``rerun`` repeats it as it was."""
+        self._begin_with(self._initial_state())
+
+    def call_with_state(self, state: Mapping[str, Any], call: Callable[[], Any]) -> tuple[Any, Mapping[str, Any]]:
+        """Call what runs this graph with a state that the caller keeps; return its value and the state after."""
+        with self._series:
+            own = self._kept
+            self.state = state
+            try:
+                return call(), self.state
+            finally:
+                self._kept = own
+
+    def _begin_with(self, kept: tuple[Any, ...]) -> None:
         with self._series, self._lock:
             self._kept = kept
         self._tell_watchers()
 
-    def reset(self) -> None:
-        """Have the next run begin with the initial state; the last run stays, and ``rerun`` repeats it as it was."""
-        with self._series, self._lock:
-            self._kept = self._initial_state()
-        self._tell_watchers()
+    def _initial_state(self) -> tuple[Any, ...]:
+        return tuple(slots.initial for slots in self._program.states)
 
-    def _state_left_by(self, run: Run) -> tuple[Any, ...]:
-        """Return what the next run begins with; arrays that others may fill again, as a payload's, are copied."""
-        program, values = self._program, run.state_after()
+    def _kept_after(self, run: Run) -> tuple[Any, ...]:
+        """Return what the run after this one begins with."""
+        return self._kept if run.failure is not None else self._kept_of(run.state_after())
+
+    def _kept_of(self, values: Sequence[Any]) -> tuple[Any, ...]:
+        """Return a state as it is kept; arrays that others may fill again, as a payload's, are copied."""
+        program = self._program
         if not program.guard:
-            return values
+            return tuple(values)
         return tuple(
             keep(value, 0, program, slots.before, ()) for slots, value in zip(program.states, values, strict=True)
         )
-
-    def _initial_state(self) -> tuple[Any, ...]:
-        return tuple(slots.initial for slots in self._program.states)
 
     def _state_of(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
         """Return a state as it is stored; what is not among the values stays as it is.
@@ -580,16 +491,11 @@ class CompGraphRunner(OldNames, TokenMapping):
             No token of this name is delayed.
         """
         require_mapping("state", values, "of delayed tokens to values")
-        program, kept = self._program, {slots.key: slots for slots in self._program.states}
+        known = {slots.key: now for slots, now in zip(self._program.states, self._kept, strict=True)}
         for key in values:
-            if key not in kept:
-                raise UnknownName("delayed token", key, kept, "in this graph: see ep.delay")
-        return tuple(
-            (keep(values[slots.key], 0, program, slots.before, ()) if program.guard else values[slots.key])
-            if slots.key in values
-            else now
-            for slots, now in zip(program.states, self._kept, strict=True)
-        )
+            if key not in known:
+                raise UnknownName("delayed token", key, known, "in this graph: see ep.delay")
+        return self._kept_of([*{**known, **values}.values()])
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -615,12 +521,10 @@ class CompGraphRunner(OldNames, TokenMapping):
         Both are given, so that what is read beside a rerun in another thread is decided from one state.
         """
         if last is None:
-            return self._beginning(hparams, {}, self._kept)
-        if last.record[4] is hparams and not self._program.revised:
+            return hparams.tokens({}, self._kept)
+        if last.hparams is hparams and not self._program.revised:
             return last.tokens
-        tokens = last.tokens.branch()
-        tokens.change(hparams.changes_since(last.record[4]))
-        return tokens
+        return last.tokens.branch(hparams.changes_since(last.hparams)).begin()
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._state
@@ -687,27 +591,45 @@ def stop_at(
     PayloadError, PlaceholderNeeded, UnknownName
         As ``run`` does.
     """
-    start_ns = perf_counter_ns()
-    hparams, program, cg = runner._state[0], runner._program, runner.cg
+    start_ns, hparams, program, cg = perf_counter_ns(), runner._state[0], runner._program, runner.cg
     needed = [] if function is None else [token for token in cg.func_inputs(function) if token not in cg.source_tokens]
+    tokens = hparams.tokens(payload, runner._kept)
     if needed:
         before = runner.trial({}, *needed, payload=payload)
         if before.failure is not None:
             runner.adopt(before)
             return before
-        tokens, durations_ns = before.tokens.branch(), dict(before.report.ran_ns)
-    else:
-        tokens, durations_ns = runner._beginning(hparams, payload, runner._kept), {}
-    wanted = bytes(len(program.steps))
-    if function is None or why is None:
-        times = program, wanted, durations_ns, perf_counter_ns() - start_ns, False, -1, ()
-        run = Run((tokens.values, bytes(tokens.dirty), tokens.has_payload, tokens.revisions, hparams, times, None))
-    else:
+        tokens = before.tokens.branch()
+        tokens.durations_ns |= before.report.ran_ns
+    # No other step was come to.
+    tokens.wanted = program.no_steps
+    if function is not None:
         tokens.running = next(step.place for step in program.steps if step.name == function)
-        run = runner._failed_run(tokens, hparams, wanted, durations_ns, start_ns, why)
+
+    def way(tokens: TokenManager) -> None:
+        if why is not None:
+            raise why
+
     try:
-        return runner._end(run, None)
+        return runner._run(tokens, hparams, (), start_ns, way=way)
     except BaseException as raised:
-        if raised is not why:
+        if raised is not why or runner.last is None:
             raise
-        return run
+        return runner.last
+
+
+def _failed(tokens: TokenManager, place: int, error: BaseException) -> Failure:
+    """Describe the failure of a step; what depends on it reads as not computed.
+
+    Of the steps that were not reached none was reused: they were not wanted.
+    """
+    program, durations_ns = tokens.program, tokens.durations_ns
+    durations_ns.setdefault(place, 0)
+    tokens.dirty = bytearray(left and at not in durations_ns for at, left in enumerate(tokens.dirty))
+    failure = failure_of(tokens, place, error)
+    tokens.forget(program.downstream([place], tokens.values))
+    reached = bytearray(tokens.wanted or program.all_steps)
+    for stale in tokens.stale:
+        reached[stale] = 0
+    tokens.wanted = bytes(reached)
+    return failure

@@ -6,7 +6,10 @@ The cost does not depend on the size of the values.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from types import MappingProxyType
 from typing import Any, Final
 
 from epypes.deprecation import OldNames
@@ -61,7 +64,7 @@ class TokenManager(OldNames):
         By slot.
     dirty
         By step, 1 if it has to run before its outputs can be read: it never ran, failed, or one of its inputs has a
-        new value.
+        new value. A bytearray while steps run one by one.
     has_payload
         Whether every source token has a value; if not, each run has to see whether it needs one that has none.
     revisions
@@ -71,6 +74,14 @@ class TokenManager(OldNames):
     origin
         The steps that were dirty before anything was changed, of which it is not known what was new to them; None in a
         run from scratch.
+    changed
+        The source tokens that have got new values since then.
+    durations_ns
+        Nanoseconds by step that ran.
+    wanted
+        By step, 1 for those that the run needs; None for all.
+    side_by_side
+        Whether threads were used.
 
     Notes
     -----
@@ -84,7 +95,25 @@ class TokenManager(OldNames):
     (1, False)
     """
 
-    __slots__ = ("_new", "_stale", "dirty", "has_payload", "origin", "program", "revisions", "running", "values")
+    # Slots: a class attribute that an object reads in their place takes several times as long.
+    __slots__ = (
+        "_new", "_stale", "changed", "dirty", "durations_ns", "has_payload", "origin", "program", "revisions",
+        "running", "side_by_side", "values", "wanted",
+    )  # fmt: skip
+    program: Program
+    values: list[Any]
+    dirty: Any
+    has_payload: bool
+    durations_ns: dict[int, int]
+    revisions: tuple[Any, ...]
+    running: int
+    origin: bytes | None
+    changed: tuple[str, ...]
+    wanted: bytes | None
+    side_by_side: bool
+    # Slots with new values.
+    _new: set[int]
+    _stale: set[int] | None
 
     def __init__(self, cg: CompGraph, values: Mapping[str, Any] | None = None) -> None:
         program = Program(cg, True)
@@ -93,53 +122,61 @@ class TokenManager(OldNames):
             cg.require_token(token)
             stored[program.slots[token]] = value
         # No function is out of date; but not every token has a value.
-        self._set(program, stored, bytearray(program.clean), False, program.revisions())
+        self.fill(program, stored, program.no_steps, False, None)
 
-    def _set(
-        self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
-    ) -> None:
-        self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
-        self.revisions = revisions
-        self.running = -1
-        self.origin: bytes | None = None
-        # Slots with new values.
-        self._new: set[int] = set()
-        self._stale: set[int] | None = None
-
-    @classmethod
-    def of_run(
-        cls, program: Program, values: list[Any], dirty: bytearray, has_payload: bool, revisions: tuple[Any, ...]
+    def fill(
+        self, program: Program, values: list[Any], dirty: bytes, has_payload: bool, origin: bytes | None
     ) -> TokenManager:
-        """Return the tokens of a run, by slot."""
-        tokens = cls.__new__(cls)
-        tokens._set(program, values, dirty, has_payload, revisions)
-        return tokens
-
-    @classmethod
-    def from_scratch(cls, program: Program, values: list[Any], has_payload: bool) -> TokenManager:
-        """Return tokens of which only source tokens have values."""
-        return cls.of_run(program, values, bytearray(b"\1") * len(program.steps), has_payload, program.revisions())
+        """Make these the tokens of a run that has not begun; return them."""
+        self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
+        self.origin = origin
+        self.running, self.changed, self.side_by_side, self.durations_ns = -1, (), False, {}
+        self.wanted = self._stale = None
+        self.revisions = program.revisions() if program.revised else ()
+        return self
 
     # -- while functions run ------------------------------------------------------------------------------------
 
-    def branch(self) -> TokenManager:
-        """Return tokens with the same values, for a run that goes on from these."""
-        program = self.program
-        branch = TokenManager.of_run(
-            program, self.values.copy(), self.dirty.copy(), self.has_payload, program.revisions()
-        )
-        for place, before, now in zip(program.revised, self.revisions, branch.revisions, strict=True):
-            branch.dirty[place] |= before != now
-        branch.origin = bytes(branch.dirty)
+    def branch(self, changes: Mapping[str, Any] = MappingProxyType({}), *, are_new: bool = False) -> TokenManager:
+        """Return tokens for a run that goes on from these; what reads a changed one is dirty when that has begun.
+
+        Parameters
+        ----------
+        changes
+            New values of source tokens.
+        are_new
+            Whether it is known that they differ from the present ones.
+        """
+        program, values, origin = self.program, self.values.copy(), bytes(self.dirty)
+        branch = new_tokens().fill(program, values, origin, self.has_payload, origin)
+        if program.revised:
+            renewed = zip(program.revised, self.revisions, branch.revisions, strict=True)
+            places = {place for place, before, now in renewed if before != now}
+            branch.dirty = branch.origin = bytes(at in places or is_dirty for at, is_dirty in enumerate(self.dirty))
+        slots = program.slots
+        if not are_new:
+            old = {token: values[slots[token]] for token in changes}
+            is_new = [not is_unchanged(old[token], value, (), program.guard) for token, value in changes.items()]
+            changes = dict(itertools.compress(changes.items(), is_new))
+        for token, value in changes.items():
+            values[slots[token]] = value
+        branch.changed = (*changes,)
         return branch
 
-    def change(self, values: Mapping[str, Any]) -> tuple[str, ...]:
-        """Give source tokens values; return those whose value is another one."""
-        slots = self.program.slots
-        return tuple([token for token, value in values.items() if self._store(slots[token], value, ())])
+    def begin(self) -> TokenManager:
+        """Make what reads a changed token dirty; return these tokens, whose steps can be run now."""
+        self.dirty, self._new = bytearray(self.dirty), set()
+        for token in self.changed:
+            self._mark(self.program.slots[token])
+        return self
 
-    def store(self, step: Step, made: Sequence[Any]) -> None:
-        """Store what a step has made, guarded if the program is; the steps that read something new become dirty."""
+    def store(self, step: Step, made: Sequence[Any] | None) -> None:
+        """Store what a step has made, guarded if the program is; the steps that read something new become dirty.
+
+        None stands for a step that was skipped, since one of its inputs is Nothing: so are all its outputs.
+        """
+        if made is None:
+            self.program.has_skipped, made = True, [Nothing] * len(step.outputs)
         self.dirty[step.place] = 0
         if self.origin is None:
             for slot, value in zip(step.outputs, made, strict=True):
@@ -149,24 +186,17 @@ class TokenManager(OldNames):
         if not self.origin[step.place]:
             given = [self.values[slot] for slot in step.inputs if slot not in self._new]
         for slot, value in zip(step.outputs, made, strict=True):
-            self._store(slot, value, given)
+            if not is_unchanged(self.values[slot], value, given, self.program.guard):
+                self.values[slot] = value
+                self._mark(slot)
 
-    def _store(self, slot: int, value: Any, given: Sequence[Any]) -> bool:
+    def _mark(self, slot: int) -> None:
+        """Take note that a slot has a new value: the steps that read it are dirty."""
         program = self.program
-        if is_unchanged(self.values[slot], value, given, program.guard):
-            return False
-        self.values[slot] = value
         self._new.add(slot)
         for place in program.consumers[slot]:
-            step = program.steps[place]
-            if step.switch is None or slot in program.read_by(step, self.values):
+            if not program.switches or slot in program.read_by(program.steps[place], self.values):
                 self.dirty[place] = 1
-        return True
-
-    def skip(self, step: Step) -> None:
-        """Store Nothing as all that a step makes, since one of its inputs is Nothing."""
-        self.program.has_skipped = True
-        self.store(step, [Nothing] * len(step.outputs))
 
     def forget(self, steps: Iterable[int]) -> None:
         """Make the outputs of these steps read as not computed."""
@@ -247,6 +277,10 @@ class TokenManager(OldNames):
 
     def __iter__(self) -> Iterator[str]:
         return (token for token in self.program.cg.tokens if self.is_readable(token))
+
+
+# Half the time of TokenManager(...).
+new_tokens: Final[Callable[[], TokenManager]] = partial(object.__new__, TokenManager)
 
 
 def skipped_steps(program: Program, values: Sequence[Any], dirty: Sequence[int]) -> tuple[int, ...]:

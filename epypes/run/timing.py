@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, overload
 
 from epypes.optional import optional_import
-from epypes.rich_display import mimebundle, to_text
+from epypes.rich_display import Displayed
 from epypes.run.program import Program
 from epypes.wording import counted
 
@@ -31,8 +31,6 @@ Durations = dict[int, int] | Sequence[int]
 Times = tuple[Program, bytes | None, Durations, int, bool, int, tuple[int, ...]]
 
 KEPT: Final = 1_000
-# Packed above that: a thousand reports would hold a gigabyte of integers.
-_MAX_UNPACKED: Final = 400
 _COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed", "skipped")
 _SUMMARY_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
 _STANDARD: Final = NormalDist()
@@ -77,11 +75,13 @@ class FunctionTime:
         return not self.ran and not self.skipped
 
 
-class RunReport:
+class RunReport(Displayed):
     """The times of one run; does not change.
 
     Attributes
     ----------
+    program
+        What was run.
     total_ns
         From the start of the run to its end, in nanoseconds.
     side_by_side
@@ -90,28 +90,17 @@ class RunReport:
         Nanoseconds by step that ran.
     """
 
-    __slots__ = ("_failed_at", "_program", "_skipped", "_wanted", "ran_ns", "side_by_side", "total_ns")
+    __slots__ = ("_failed_at", "_skipped", "_wanted", "program", "ran_ns", "side_by_side", "total_ns")
 
     def __init__(
-        self,
-        program: Program,
-        wanted: bytes | None,
-        durations_ns: Durations,
-        total_ns: int,
-        side_by_side: bool = False,
-        failed_at: int = -1,
-        skipped: Sequence[int] = (),
-    ) -> None:
-        self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
+        self, program: Program, wanted: bytes | None, durations_ns: Durations, total_ns: int,
+        side_by_side: bool = False, failed_at: int = -1, skipped: Sequence[int] = (),
+    ) -> None:  # fmt: skip
+        self.program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
         self._failed_at, self._skipped = failed_at, skipped
         if not isinstance(durations_ns, dict):
             durations_ns = {place: duration for place, duration in enumerate(durations_ns) if duration >= 0}
         self.ran_ns = durations_ns
-
-    @property
-    def program(self) -> Program:
-        """What was run."""
-        return self._program
 
     @property
     def functions(self) -> tuple[FunctionTime, ...]:
@@ -119,14 +108,14 @@ class RunReport:
         ran_ns, wanted, failed_at, skipped = self.ran_ns, self._wanted, self._failed_at, frozenset(self._skipped)
         return tuple(
             FunctionTime(step.name, ran_ns.get(place, 0), place in ran_ns, place == failed_at, place in skipped)
-            for place, step in enumerate(self._program.steps)
+            for place, step in enumerate(self.program.steps)
             if wanted is None or wanted[place] or place in ran_ns
         )
 
     @property
     def durations_ns(self) -> dict[str, int]:
         """Nanoseconds by function that ran, in run order; of one that failed until it raised."""
-        return {self._program.steps[place].name: self.ran_ns[place] for place in sorted(self.ran_ns)}
+        return {self.program.steps[place].name: self.ran_ns[place] for place in sorted(self.ran_ns)}
 
     @property
     def ran(self) -> tuple[str, ...]:
@@ -136,12 +125,12 @@ class RunReport:
     @property
     def is_whole(self) -> bool:
         """Whether every function of the graph ran, and none failed."""
-        return self._failed_at < 0 and len(self.ran_ns) == len(self._program.steps)
+        return self._failed_at < 0 and len(self.ran_ns) == len(self.program.steps)
 
     @property
     def failed(self) -> str | None:
         """The function that failed, or None."""
-        return None if self._failed_at < 0 else self._program.steps[self._failed_at].name
+        return None if self._failed_at < 0 else self.program.steps[self._failed_at].name
 
     @property
     def reused(self) -> tuple[str, ...]:
@@ -156,7 +145,7 @@ class RunReport:
     @property
     def critical_path_ns(self) -> int:
         """The longest time that functions which need each other's outputs took one after another, in nanoseconds."""
-        return longest_path_ns(self._program, self.ran_ns)
+        return longest_path_ns(self.program, self.ran_ns)
 
     @property
     def overhead_ns(self) -> int:
@@ -192,30 +181,19 @@ class RunReport:
         ran, more = len(self.ran) - failed, f", {skipped} skipped" * bool(skipped) + ", 1 failed" * failed
         return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{more}>"
 
-    def __str__(self) -> str:
-        from epypes.rich_display import to_text
 
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.rich_display import mimebundle
-
-        return mimebundle(self)
+def packed(program: Program, durations_ns: dict[int, int]) -> Durations:
+    """Return the durations of a run of a large graph as they are kept; few are kept as they are."""
+    if 4 * len(durations_ns) < len(program.steps):
+        return durations_ns
+    return array("q", [durations_ns.get(step.place, -1) for step in program.steps])
 
 
-class Reports(Sequence[RunReport]):
+class Reports(Displayed, Sequence[RunReport]):
     """The reports of a runner's last 1,000 runs, the oldest first; without the values of their tokens."""
 
     def __init__(self) -> None:
         self.kept: deque[Times] = deque(maxlen=KEPT)
-
-    def add(self, times: Times) -> None:
-        """Keep the times of one more run."""
-        durations_ns = times[2]
-        if len(durations_ns) > _MAX_UNPACKED and isinstance(durations_ns, dict):
-            packed = array("q", [durations_ns.get(step.place, -1) for step in times[0].steps])
-            times = (*times[:2], packed, *times[3:])
-        self.kept.append(times)
 
     @overload
     def __getitem__(self, index: int) -> RunReport: ...
@@ -242,16 +220,6 @@ class Reports(Sequence[RunReport]):
 
     def __repr__(self) -> str:
         return f"<Reports of {counted(len(self), 'run')}>"
-
-    def __str__(self) -> str:
-        from epypes.rich_display import to_text
-
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.rich_display import mimebundle
-
-        return mimebundle(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,11 +303,10 @@ class LogNormal:
             return math.nan
         if duration_ns <= 0:
             return 0.0
-        away = math.log(duration_ns) - self.mu
+        log = math.log(duration_ns)
         if self.sigma == 0:
-            return 0.0 if away else math.inf
-        scale = duration_ns * self.sigma * math.sqrt(2 * math.pi)
-        return math.exp(-((away / self.sigma) ** 2) / 2) / scale
+            return math.inf if log == self.mu else 0.0
+        return NormalDist(self.mu, self.sigma).pdf(log) / duration_ns
 
     def __repr__(self) -> str:
         if not self.is_fitted:
@@ -348,7 +315,7 @@ class LogNormal:
 
 
 @dataclass(frozen=True, slots=True)
-class TimingSummary:
+class TimingSummary(Displayed):
     """The times of many runs, without those that failed; shows itself as bars and as a table.
 
     Of fewer than 5 durations no range from 5 % to 95 % is shown: few runs say nothing of the tails.
@@ -397,12 +364,6 @@ class TimingSummary:
         functions = len(self.functions)
         return f"<TimingSummary: {counted(self.runs, 'run')}, {counted(functions, 'function')}>"
 
-    def __str__(self) -> str:
-        return to_text(self)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return mimebundle(self)
-
 
 def summarize(reports: Iterable[RunReport]) -> TimingSummary:
     """Summarize the times of many runs by log-normal distributions.
@@ -442,7 +403,8 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
             raise TypeError(f"summarize takes RunReports, such as runner.reports, not {kind!r}.")
     ended = [report for report in given if report.failed is None]
     if not ended:
-        raise ValueError(_all_failed(len(given)))
+        failed = "The only run has failed" if len(given) == 1 else f"All {len(given)} runs have failed"
+        raise ValueError(f"{failed}, so there are no times to summarize. runner.last.failure says why.")
     durations = _by_function(ended)
     return TimingSummary(
         functions=MappingProxyType({name: _fit(values) for name, values in durations.items() if values}),
@@ -452,11 +414,6 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
         side_by_side=any(report.side_by_side for report in ended),
         failed_runs=len(given) - len(ended),
     )
-
-
-def _all_failed(count: int) -> str:
-    failed = "The only run has failed" if count == 1 else f"All {count} runs have failed"
-    return f"{failed}, so there are no times to summarize. runner.last.failure says why."
 
 
 def _by_function(reports: Sequence[RunReport]) -> dict[str, list[int]]:

@@ -93,7 +93,7 @@ def test_errors_are_drawn_as_a_tree_that_is_true():
     docstring = errors.__doc__
     kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.EpypesError)]
     for kind in kinds:
-        assert kind.__name__ in docstring, "every error is in the picture"
+        assert kind.__name__ in docstring or kind.__name__.startswith("_"), "every error is in the picture"
         assert kind.__doc__
 
 

@@ -36,7 +36,6 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
         "epypes/catalog/skimage.toml",
         "epypes/display/paint/explore.js",
         "epypes/display/paint/explore.css",
-        "epypes_widgets/view/picker.css",
         "epypes_widgets/view/picker.js",
         "epypes_widgets/view/main.js",
         "epypes_widgets/view/view.css",

@@ -10,7 +10,7 @@ from skimage import data, measure
 
 import epypes as ep
 from epypes.display import encode_image, mimebundle, to_svg
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.display.previews.preview import preview
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.timing import Effort

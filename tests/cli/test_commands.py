@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import json
+import queue
 import shutil
 
 import click
@@ -15,6 +17,7 @@ from epypes.cli import main
 from epypes.cli.app import app
 from epypes.service import Service
 from epypes.service.state_file import StateLock
+from tests.bundle.test_slicer import notebook
 from tests.colours import red_image, red_runner
 
 ANY = "tcp://127.0.0.1:*"
@@ -121,7 +124,13 @@ def test_help_names_every_command(epypes):
         ("image", ["a-b=c.png"], "Image 'a-b=c.png' can't be read"),
         ("image", ["image=a-b=c.png"], "Image 'a-b=c.png' can't be read"),
         ("image", ["a.png", "--out", "edge=b.png"], "No output token 'edge'"),
-        ("image", ["a.png", "b.png"], "Which input is 'a.png'? Write one of: image=FILE"),
+        (
+            "image",
+            ["a.png", "b.png"],
+            "Two values for the input 'image': 'a.png' and 'b.png'. Give one. Many images: ep",
+        ),
+        ("image", ["image=a.png", "image=b.png"], "Two values for the input 'image': 'a.png' and 'b.png'. Give one."),
+        ("image", ["a.png", "--out", "a.png", "--out", "b.png"], "Two values for the output 'edges': 'a.png' and"),
         ("left right", ["left=l.png"], "Missing input: right=FILE"),
         ("left right", ["l.png", "r.png"], "Which input is 'l.png'? Write one of: left=FILE, right=FILE"),
         ("left right", ["lefd=l.png", "right=r.png"], "Did you mean 'left'"),
@@ -166,3 +175,36 @@ def test_files_have_the_right_colours_whatever_the_order_of_the_tokens(epypes, t
     assert done.returncode == 0, done.stderr
     assert cv2.imread(str(tmp_path / "red.png"))[5, 5].tolist() == [0, 0, 200], "OpenCV reads BGR: it is red"
     assert cv2.imread(str(tmp_path / "unsaid.png"))[5, 5].tolist() == [200, 0, 0], "unmarked is BGR"
+
+
+@pytest.mark.slow
+def test_an_answer_of_an_f_out_of_the_users_own_is_printed_as_text_and_as_json(epypes, photograph, tmp_path):
+    names = notebook(
+        "from epypes.wire import Envelope\n\n\n"
+        "def total(image, k):\n    return float(image.sum()) * k\n\n\n"
+        "def f_in(event):\n    return {'image': event.parts['image']}\n\n\n"
+        "def f_out(view):\n"
+        "    parts = {'total': view['sum'], 'most': np.array([np.inf, 2.0]), 'image': view['image'], 'names': ['a', None]}\n"
+        "    return Envelope('answer', parts, correlation_id=view.event.id)\n"
+    )
+    cg = ep.CompGraph({"total": names["total"]}, {"total": (("image", "k"), "sum")})
+    pipe = ep.FullPipeline("own", cg, queue.Queue(), queue.Queue(), names["f_in"], names["f_out"], {"k": 2})
+    pipe.run(image=photograph)
+    bundle = ep.promote(pipe, tmp_path / "own")
+    write_image(tmp_path / "photo.png", photograph)
+    with StateLock(bundle.path) as lock, Service(bundle.path, ANY, ANY) as service:
+        lock.publish(service.start())
+        text = epypes("call", bundle.path, tmp_path / "photo.png")
+        answer = epypes("call", bundle.path, tmp_path / "photo.png", "--json")
+        absent = epypes("call", bundle.path, tmp_path / "photo.png", "--out", tmp_path / "x.png")
+    assert text.returncode == answer.returncode == 0, text.stderr + answer.stderr
+    total = 2 * float(photograph.sum())
+    assert f"\ntotal = {total}\n" in f"\n{text.stdout}"
+    assert "round trip" in text.stdout
+    found = json.loads(answer.stdout)
+    assert found["tokens"] == {
+        "total": total, "most": ["inf", 2.0], "image": {"dtype": "uint8", "shape": [400, 600, 3]}, "names": ["a", None],
+    }  # fmt: skip
+    assert (found["total_ns"], found["overhead_ns"]) == (None, None)
+    assert found["round_trip_ns"] > 0
+    assert "The answer has no 'sum'; it has: total, most, image, names." in one_line(absent)

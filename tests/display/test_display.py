@@ -17,7 +17,7 @@ from PIL import Image
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.display.text import THUMBNAIL_CHARACTERS
 from tests.colours import red_image, red_runner
 from tests.pictures import assert_same_picture
@@ -297,7 +297,7 @@ def test_a_value_whose_class_lies_can_be_run_and_shown():
 
 
 def test_graphviz_is_not_asked_for_what_would_take_it_minutes(monkeypatch):
-    monkeypatch.setattr("epypes.display.layout.graphviz._dot_source", lambda *graph: pytest.fail("asked"))
+    monkeypatch.setattr("epypes.display.layout._dot_source", lambda *graph: pytest.fail("asked"))
     sources = tuple(f"s{index}" for index in range(100))
     io = {f"f{index}": (sources, f"t{index}") for index in range(100)}
     svg = to_svg(ep.CompGraph(dict.fromkeys(io, lambda *xs: 1), io))

@@ -7,10 +7,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg
-from epypes.display.layout.blocks import fold
-from epypes.display.layout.geometry import Box, Layout
-from epypes.display.layout.graphviz import routed_layout
-from epypes.display.layout.placement import lay_out, ranks
+from epypes.display.layout import Box, Layout, fold, lay_out, ranks, routed_layout
 from epypes.display.paint.svg import paint_edges
 from epypes.display.views.graphview import EdgeView
 
@@ -82,6 +79,26 @@ def test_vertices_of_other_sizes_or_neighbours_keep_their_places():
     assert {round(x) for x, _ in lay_out(boxes, edges).centres} in (
         {round(x) for x, _ in graphviz.centres}, {round(graphviz.width - x) for x, _ in graphviz.centres}
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+@pytest.mark.parametrize("tail", [5, 6], ids=["the function's own output", "a later one"])
+def test_an_edge_that_leads_back_passes_no_vertex_though_both_sides_are_taken(tail, direction):
+    """Functions 0 to 2; 3 and 4 stand beside the token 7 that the edge leads to, 8 and 9 beside those it leads from."""
+    boxes = (BOX,) * 11
+    edges = ((3, 0), (7, 0), (4, 0), (0, 8), (0, 5), (0, 9), (5, 1), (1, 6), (8, 2), (6, 2), (9, 2), (2, 10))
+    layout = lay_out(boxes, edges, False, direction, ((tail, 7),))
+    assert_ends_at_their_vertices(boxes, (*edges, (tail, 7)), layout)
+    places = list(points_on(layout.splines[-1]))
+    assert not any(is_in(place, vertex, boxes, layout) for place in places for vertex in range(11))
+    assert all(0 <= x <= layout.width and 0 <= y <= layout.height for x, y in places)
+
+
+def test_many_edges_that_lead_far_back_are_arcs():
+    boxes, edges = chain_with_a_shared_token(60)
+    back = tuple((60 + index, 60) for index in range(30, 61))
+    layout = lay_out(boxes, edges, back=back)
+    assert_ends_at_their_vertices(boxes, (*edges, *back), layout)
 
 
 # -- blocks -----------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.display.paint.svg import alt_text, paint_svg
 from epypes.display.paint.tables import paint_text
 from epypes.pipeline.reactive import queue_stage

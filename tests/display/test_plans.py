@@ -10,7 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.run.program import Program
 from tests.display.test_display import SVG, texts, vertices
 
@@ -294,8 +294,7 @@ def test_overhead_of_functions_side_by_side_is_labelled_for_what_it_is():
     assert table_of(report_of(4, side_by_side=True)._repr_mimebundle_()["text/html"])[-1][0] == label
     run = branching_runner().run(image=1)
     assert label not in view(run).caption
-    *record, times, failure = run.record
-    run = ep.Run((*record, (*times[:4], True, -1), failure))
+    run = ep.Run(run.tokens, run.hparams, (*run.times[:4], True, -1, ()), None)
     assert label in view(run).caption
     assert label in unescape(mimebundle(run)["text/html"])
 

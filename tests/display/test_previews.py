@@ -26,6 +26,8 @@ from skimage import data, measure, segmentation
 import epypes as ep
 from epypes.display import Chart, encode_image, is_image, mimebundle
 from epypes.display.previews.preview import preview
+from epypes.errors import MissingPackage
+from epypes.optional import LazyModule
 from tests.colours import red_image
 
 
@@ -801,3 +803,41 @@ def test_a_preview_that_shows_the_run_that_it_is_in_ends():
     run = ep.CompGraphRunner(cg).run(x=Part(), z=Part())
     assert mimebundle(run)["image/svg+xml"].count(">shown<") == 2
     assert len(called) == 2
+
+
+@pytest.mark.slow
+def test_a_graph_without_arrays_is_shown_where_neither_numpy_nor_pillow_is_installed():
+    code = (
+        "import sys; sys.modules.update(numpy=None, PIL=None, cv2=None)\n"
+        "import epypes as ep; from epypes.display import mimebundle\n"
+        "cg = ep.CompGraph({'f': lambda x, k: ([x, k], {'x': x})}, {'f': (('x', 'k'), ('y', 'z'))})\n"
+        "runner = ep.CompGraphRunner(cg, {'k': 2}); runner.run(x=1.5); shown = mimebundle(runner)\n"
+        "assert 'list of 2' in shown['image/svg+xml'] and 'no p' not in shown['image/svg+xml'], shown"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_package_that_is_missing_is_named_where_it_is_used_first(monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    lazy = LazyModule("optuna")
+    assert not hasattr(lazy, "__wrapped__"), "looking at a module loads nothing"
+    with pytest.raises(MissingPackage, match=r"epypes\[scale\]"):
+        lazy.create_study  # noqa: B018
+
+
+@pytest.mark.parametrize("way", ["preview function", "repr"])
+def test_what_a_users_function_shows_of_its_own_run_names_its_values(way):
+    shown = []
+
+    class Seen:
+        def __repr__(self):
+            shown.append(mimebundle(runner)["image/svg+xml"])
+            return "seen"
+
+    if way == "preview function":
+        ep.register_preview(Seen, repr)
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda x: Seen()}, {"f": ("x", "y")}))
+    runner.run(x="some text")
+    assert "seen" in mimebundle(runner)["image/svg+xml"]
+    assert shown, "once, and not without end"
+    assert "Seen" in shown[0]

@@ -13,7 +13,7 @@ from PIL import Image
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.display.paint.svg import paint_svg
 from epypes.display.previews.preview import Chart, Preview
 from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, StageView, TokenView, from_json, to_json

@@ -17,7 +17,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.display.views.graphview import from_json, to_json
 from epypes.run import execute
 from tests.display.test_display import SVG, texts, vertices

@@ -11,7 +11,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.layout.placement import lay_out
+from epypes.display.layout import lay_out
 from epypes.display.text import THUMBNAIL_CHARACTERS
 
 SVG = "{http://www.w3.org/2000/svg}"

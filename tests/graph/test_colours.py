@@ -197,6 +197,10 @@ def of_a_map(image):
     plt.imshow(image, cmap="gray")
 
 
+def of_a_map_by_position(image):
+    plt.imshow(image, "gray")
+
+
 def other_axis(image):
     return skimage.color.rgb2gray(image, channel_axis=0)
 
@@ -232,7 +236,8 @@ class Odd:
     ("function", "inputs"),
     [
         (asks, 2), (both, 1), (perhaps, 2), (perhaps_before, 2), (of_something_else, 1), (exchanged_in_place, 1),
-        (repeated, 1), (of_a_sensor, 1), (of_a_map, 1), (other_axis, 1), (another_library, 1),
+        (repeated, 1), (of_a_sensor, 1), (of_a_map, 1), (of_a_map_by_position, 1), (other_axis, 1),
+        (another_library, 1),
         (converting(gray), 1), (Odd(), 1), (cv2.cvtColor, 2), (functools.partial(cv2.cvtColor, code=4), 1),
     ],
 )  # fmt: skip

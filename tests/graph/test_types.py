@@ -151,6 +151,16 @@ def test_a_tuple_is_split_over_the_output_tokens(returned, fits):
         assert [finding.kind for finding in error.value.findings] == ["types"]
 
 
+def test_variadic_parameters_speak_for_every_input_that_they_take():
+    def stack(first: str, *others: int) -> str:
+        return first
+
+    io = {"f": ("x", "y"), "stack": (("a", "b", "y"), "z")}
+    with pytest.raises(GraphError, match="'f' makes token 'y' as str, but 'stack' takes it as int"):
+        ep.CompGraph({"f": made, "stack": stack}, io)
+    ep.CompGraph({"f": made, "stack": stack}, {"f": ("x", "y"), "stack": (("y", "b"), "z")})
+
+
 def test_a_tuple_of_another_length_than_the_outputs_is_named():
     def f(x) -> tuple[int, int, int]:
         return x, x, x

@@ -1,18 +1,27 @@
 from __future__ import annotations
 
 import enum
+import functools
 from typing import Annotated, Literal
 
 import annotated_types
 import pytest
 
+import epypes as ep
 from epypes import Param, Roi
-from epypes.hints import annotated_param, as_param, param_from_value
+from epypes.graph import annotated_params
+from epypes.hints import as_param, param_from_value
 
 
 class Method(enum.Enum):
     CANNY = 1
     SOBEL = 2
+
+
+def annotated_param(function, position, count=None):
+    """The range of the token at a position of a function's io."""
+    tokens = tuple(f"token_{place}" for place in range(count or position + 1))
+    return next(annotated_params(ep.CompGraph({"f": function}, {"f": (tokens, "out")}), tokens[position]), None)
 
 
 def annotated(
@@ -38,11 +47,10 @@ def annotated(
         (5, Param(choices=(False, True))),
         (6, None),
         (7, None),
-        (8, None),
     ],
 )
 def test_annotations_say_the_range(position, expected):
-    assert annotated_param(annotated, position) == expected
+    assert annotated_param(annotated, position, 8) == expected
 
 
 @pytest.mark.parametrize("function", [len, print, int, lambda x: x])
@@ -115,3 +123,12 @@ def test_an_annotation_may_be_a_rectangle():
     def cut(image, part: Annotated[tuple, Roi("image")]): ...
 
     assert annotated_param(cut, 1) == Roi("image")
+
+
+def test_a_method_a_cached_function_and_a_node_say_the_range_of_what_they_call():
+    class Filter:
+        def blur(self, image, k: Annotated[int, Param(1, 31, odd=True)]): ...
+
+    for function in (Filter().blur, functools.lru_cache(Filter().blur), ep.Node("blur", Filter().blur)):
+        assert annotated_param(function, 1) == Param(1, 31, odd=True)
+        assert annotated_param(function, 0, 2) is None

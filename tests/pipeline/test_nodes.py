@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -102,3 +104,13 @@ def test_a_rerun_counts_as_no_call_and_the_overhead_is_still_that_of_the_call():
     pipe(1)
     pipe.runner.rerun(k=2)
     assert pipe.compute_overhead() == pytest.approx(pipe.time - sum(node.time for node in pipe.network.nodes.values()))
+
+
+def test_nodes_count_the_calls_of_a_runner_that_is_gone():
+    network = ep.NodeBasedCompGraph(ep.CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")}))
+    runner = ep.CompGraphRunner(network)
+    for x in range(10):
+        runner.run(x=x)
+    del runner
+    gc.collect()
+    assert network.nodes["double"].run_count == 10

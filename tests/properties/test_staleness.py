@@ -25,8 +25,8 @@ from hypothesis.stateful import (
 import epypes as ep
 from epypes.errors import NotComputed, PayloadError, PlaceholderNeeded
 from epypes.run import execute
+from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.program import Program
-from epypes.run.staleness import TokenManager
 
 NOT_COMPUTED = object()
 VALUES = st.integers(0, 4)
@@ -335,12 +335,12 @@ def test_side_by_side_ends_as_one_after_another(graph, data):
         for slot, token in enumerate(cg.tokens)
     ]
     ends = []
-    for run in (execute.run_one_by_one, lambda *args: execute.SideBySide(*args, 3).run()):
-        tokens = TokenManager.from_scratch(program, values.copy(), True)
-        durations, failed = {}, None
+    for run in (execute.run_one_by_one, lambda tokens: execute.SideBySide(tokens, 3).run()):
+        tokens = Hyperparameters(program, {}).tokens({}, ())
+        tokens.values[:], failed = values, None
         try:
-            run(tokens, None, durations)
+            run(tokens)
         except ArithmeticError:
             failed = tokens.running
-        ends.append((tokens.values, bytes(tokens.dirty), set(durations), failed))
+        ends.append((tokens.values, bytes(tokens.dirty), set(tokens.durations_ns), failed))
     assert ends[0] == ends[1]

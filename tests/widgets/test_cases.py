@@ -181,11 +181,13 @@ def test_files_are_read_once_and_one_that_is_missing_fails_its_case(
         panel.close(TIMEOUT_S)
 
 
-def test_cases_without_checks_are_test_images_only(runner: ep.CompGraphRunner, images: list[Any]) -> None:
+def test_cases_without_checks_are_test_images_only(
+    runner: ep.CompGraphRunner, images: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     panel = tune(runner, cases=images)
     try:
         assert panel.check(TIMEOUT_S) is None
-        assert panel._screen.verdicts is None
+        assert FrontEnd(panel, monkeypatch).of("cases") == []
     finally:
         panel.close(TIMEOUT_S)
 

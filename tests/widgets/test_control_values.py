@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes.hints import Roi
-from epypes_widgets.controls import column, controls
+from epypes_widgets.column import column
+from epypes_widgets.controls import controls
 from tests.widgets.making import at, made, moves, runner_of
 
 
@@ -180,6 +181,20 @@ def test_an_even_number_is_refused_where_only_odd_ones_are_taken() -> None:
         entry.write({"x": 12})
 
 
+@pytest.mark.parametrize(
+    ("value", "hint", "kind"),
+    [
+        (1.7e308, ep.Param(1.0, 1.7e308, log=True), "log"),
+        (1e308, (0.0, 1.7e308), "slider"),
+        (1e308, ep.Param(soft=(1e307, 1.7e308)), "slider"),
+        (5, ep.Param(0, soft=(5, 5)), "slider"),
+        (5.0, ep.Param(0.0, soft=(0.0, math.inf)), "slider"),
+    ],
+)
+def test_a_number_near_the_greatest_or_in_an_open_range_has_a_slider(value: Any, hint: Any, kind: str) -> None:
+    assert made(value, hint).kind == kind
+
+
 def test_a_slider_that_is_stretched_keeps_its_places() -> None:
     entry = made(32, ep.Param(0, 1000, 16, soft=(16, 64)))
     entry.write({"x": 100})
@@ -193,6 +208,14 @@ def test_a_slider_that_is_stretched_keeps_its_places() -> None:
 
 def test_a_value_outside_of_the_soft_range_is_offered_from_the_beginning() -> None:
     assert made(60, ep.Param(0, 100, soft=(0, 10))).widget.max == 60
+
+
+def test_a_choice_that_is_gone_back_to_is_the_value_that_was_there() -> None:
+    entry = made(1.0, [0, 1, 2])
+    told = moves(entry)
+    entry.widget.index = 2
+    entry.widget.index = 1
+    assert [(values["x"], type(values["x"])) for values in told] == [(2, int), (1.0, float)]
 
 
 def test_named_choices_are_shown_by_name_and_two_may_have_one_value() -> None:

@@ -173,12 +173,6 @@ def test_the_oldest_are_dropped_also_from_undo() -> None:
     assert not history.can_undo, "what was before is gone"
 
 
-@pytest.mark.parametrize("limit", [0, -1, 2.5, "3", True])
-def test_a_limit_that_keeps_nothing_is_refused(limit: Any) -> None:
-    with pytest.raises(ValueError, match="1 or more"):
-        History(limit)
-
-
 def test_threads_that_commit_at_once_lose_nothing() -> None:
     history = History()
 

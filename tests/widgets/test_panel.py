@@ -398,6 +398,11 @@ def test_a_panel_on_what_has_been_run_computes_nothing(runner: ep.CompGraphRunne
     assert "up to date" in repr(panel)
     panel.wait(60)
     assert (calls.counts, panel._session.image, list(panel.history["image"])) == ({}, 1, [1])
+    panel["threshold"] = 90
+    panel.wait(60)
+    runner.rerun(threshold=91)
+    panel.wait(60)
+    assert panel._session.image == 1, "also when it is run again"
     panel.close(10)
 
 

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 import epypes as ep
 from epypes.display import Backdrop, Scene
-from epypes_widgets.stages import Stage, probe, stages
+from epypes_widgets.stages import probe, stages
 from tests.colours import red_image, red_runner
 
 SIZE = (40, 30)
@@ -28,7 +28,7 @@ def texts(images: dict[str, Any], x: float, y: float, size: tuple[int, int] = SI
     """Return what is told of these images at a pixel of one of this size."""
     cg = ep.CompGraph({"end": lambda *images: None}, {"end": (tuple(images), "end")})
     run = ep.CompGraphRunner(cg).run(**images)
-    told = probe(run, [Stage(token, True) for token in images], x, y, shown(run, next(iter(images)), size))
+    told = probe(run, dict.fromkeys(images, True), x, y, shown(run, next(iter(images)), size))
     assert {row["state"] for row in told} <= {"fresh"}
     assert [row["token"] for row in told] == list(images)[: len(told)]
     return [row["text"] for row in told]
@@ -88,7 +88,7 @@ def test_labels_of_a_new_run_are_looked_at_anew() -> None:
     labels = np.zeros((30, 40), np.int32)
     labels[5:20, 5:20] = 7
     runner = ep.CompGraphRunner(ep.CompGraph({"as_is": lambda image: image}, {"as_is": ("image", "same")}))
-    same = [Stage("same", True)]
+    same = {"same": True}
     noise = np.random.default_rng(0).integers(0, 100_000, (30, 40))
     runs = (runner.run(image=seen) for seen in (labels, noise, labels))
     told = [probe(run, same, 6, 6, shown(run, "same"))[0]["text"] for run in runs]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.promotion import Outcome, ReportingJob, proposal, start_promotion
+from epypes_widgets.promotion import BundleJob, Outcome, proposal
 
 pytestmark = pytest.mark.slow
 
@@ -25,14 +25,14 @@ class Told:
     def __init__(self) -> None:
         self.outcomes: list[Outcome] = []
         self.threads: list[threading.Thread] = []
-        self.promotion = ReportingJob("epypes-promotion", self._arrives)
+        self.promotion = BundleJob(self._arrives)
 
     def _arrives(self, outcome: Outcome) -> None:
         self.outcomes.append(outcome)
         self.threads.append(threading.current_thread())
 
     def promoted(self, runner: ep.CompGraphRunner, to: object, outputs: Any = None) -> Outcome:
-        assert start_promotion(self.promotion, runner, str(to), outputs)
+        assert self.promotion.promote(runner, str(to), outputs)
         outcome = self.promotion.wait(TIMEOUT_S)
         assert outcome is self.outcomes[-1]
         return outcome
@@ -63,6 +63,7 @@ def test_a_bundle_is_written_and_said_to_be_identical(told: Told, edges: ep.Comp
     target = tmp_path / "edges"
     outcome = told.promoted(edges, target, ["edges"])
     assert outcome == Outcome(
+        "promoted",
         "done",
         f"Promoted to {target}: output edges; 1 sample replayed in a fresh process, identical.\n"
         "No function says the order of the colours of 'image': bgr is assumed. If it is rgb, annotate a parameter: "
@@ -73,7 +74,6 @@ def test_a_bundle_is_written_and_said_to_be_identical(told: Told, edges: ep.Comp
     assert threading.current_thread() not in told.threads
     assert all(thread.daemon for thread in told.threads)
     assert ep.load(target).hyperparameters == edges.hyperparameters
-    assert not told.promotion.is_running
 
 
 def test_a_runner_of_which_only_a_stage_was_run_is_completed(
@@ -159,16 +159,15 @@ def test_one_promotion_runs_at_a_time(told: Told, tmp_path: Path) -> None:
     runner.run(x=1)
     go_on.clear()
     begun.clear()
-    assert start_promotion(told.promotion, runner, str(tmp_path / "a"))
+    assert told.promotion.promote(runner, str(tmp_path / "a"))
     assert begun.wait(TIMEOUT_S)
-    assert told.promotion.is_running
-    assert not start_promotion(told.promotion, runner, str(tmp_path / "b"))
+    assert not told.promotion.promote(runner, str(tmp_path / "b"))
     assert [outcome.to for outcome in told.outcomes] == [str(tmp_path / "a")]
-    with pytest.raises(TimeoutError, match="did not end within"):
+    with pytest.raises(TimeoutError, match="still computing"):
         told.promotion.wait(0.01)
     go_on.set()
     told.promotion.wait(TIMEOUT_S)
-    assert start_promotion(told.promotion, runner, str(tmp_path / "b")), "after it the next may begin"
+    assert told.promotion.promote(runner, str(tmp_path / "b")), "after it the next may begin"
     told.promotion.wait(TIMEOUT_S)
 
 
@@ -176,9 +175,9 @@ def test_a_report_that_fails_ends_nothing(edges: ep.CompGraphRunner, tmp_path: P
     def broken(_outcome: Outcome) -> None:
         raise RuntimeError("the view is gone")
 
-    promotion = ReportingJob("epypes-promotion", broken)
+    promotion = BundleJob(broken)
     assert promotion.wait(0.0) is None
-    assert start_promotion(promotion, edges, str(tmp_path / "b"))
+    assert promotion.promote(edges, str(tmp_path / "b"))
     outcome = promotion.wait(TIMEOUT_S)
     assert outcome is not None
     assert outcome.state == "done"

@@ -13,6 +13,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import SettingsError
+from epypes_widgets import tune
 from epypes_widgets.settings import load, names, save
 
 
@@ -26,15 +27,8 @@ class Flags(enum.IntFlag):
     B = 2
 
 
-def graph(*tokens: str) -> ep.CompGraph:
-    return ep.CompGraph(
-        {f"keep_{place}": repr for place, _ in enumerate(tokens)},
-        {f"keep_{place}": (token, f"{token} kept") for place, token in enumerate(tokens)},
-    )
-
-
 def there_and_back(tmp_path: Path, values: dict[str, Any], present: dict[str, Any] | None = None) -> dict[str, Any]:
-    return load(save(tmp_path / "x", values, graph(*values)), values if present is None else present)
+    return load(save(tmp_path / "x", values), values if present is None else present)
 
 
 def refused(path: Path, present: dict[str, Any]) -> tuple[str, ...]:
@@ -73,14 +67,8 @@ def test_names_of_any_kind_come_back(tmp_path: Path) -> None:
 
 
 def test_a_file_can_be_read_and_edited_by_a_person(tmp_path: Path) -> None:
-    def smooth(image: Any, side: Annotated[int, ep.Param(1, 31, odd=True, unit="px")]) -> Any:
-        return image
-
-    cg = ep.CompGraph(
-        {"smooth": smooth, "above": lambda image, lo: image},
-        {"smooth": (("im", "side"), "s"), "above": (("s", "lo"), "m")},
-    )
-    file = save(tmp_path / "good", {"side": 5, "lo": (1, 2)}, cg, {"lo": ep.Param(0, 255, unit="gray\nlevels\x07")})
+    params = {"side": ep.Param(1, 31, odd=True, unit="px"), "lo": ep.Param(0, 255, unit="gray\nlevels\x07")}
+    file = save(tmp_path / "good", {"side": 5, "lo": (1, 2)}, params)
     assert file == tmp_path / "good.toml"
     assert file.read_text().splitlines() == [
         "# Values of hyperparameters, saved by a panel of EPypes. They may be edited; the rest may not.",
@@ -94,8 +82,19 @@ def test_a_file_can_be_read_and_edited_by_a_person(tmp_path: Path) -> None:
     assert load(file, {"side": 5, "lo": (1, 2)}) == {"side": 7, "lo": (1, 2)}
 
 
+def test_the_file_of_a_panel_has_the_ranges_and_units_of_annotations(tmp_path: Path) -> None:
+    def smooth(image: Any, side: Annotated[int, ep.Param(1, 31, odd=True, unit="px")]) -> Any:
+        return image
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"smooth": smooth}, {"smooth": (("im", "k"), "s")}), {"k": 5})
+    runner.run(im=np.zeros((8, 8), np.uint8))
+    panel = tune(runner)
+    assert "k = 5 # odd 1 to 31 px" in panel.save(tmp_path / "good").read_text()
+    panel.close(60)
+
+
 def test_a_hint_that_is_no_range_is_passed_over(tmp_path: Path) -> None:
-    file = save(tmp_path / "x.toml", {"k": 1, "of_no_graph": 2}, graph("k"), {"k": object(), "of_no_graph": None})
+    file = save(tmp_path / "x.toml", {"k": 1, "of_no_graph": 2}, {"k": object(), "of_no_graph": None})
     assert tomllib.loads(file.read_text())["hyperparameters"] == {"k": 1, "of_no_graph": 2}
 
 
@@ -136,17 +135,15 @@ def test_all_that_is_wrong_is_said_at_once_with_the_nearest_names(tmp_path: Path
 def test_values_that_can_not_be_written_are_all_named_and_nothing_is_written(tmp_path: Path) -> None:
     values = {"kernel": np.ones(1_000), "f": len, "flags": Flags.A | Flags.B, "half": "\ud800", "fine": 1}
     with pytest.raises(SettingsError) as caught:
-        save(tmp_path / "x", values, graph(*values))
+        save(tmp_path / "x", values)
     assert [reason.split("'")[1] for reason in caught.value.reasons] == ["kernel", "f", "flags", "half"]
     assert "which TOML can't hold" in caught.value.reasons[0]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_file_names_the_nearest_one(tmp_path: Path) -> None:
-    assert refused(tmp_path / "good", {}) == (
-        f"There is no file {tmp_path / 'good.toml'}. There are no settings in that folder.",
-    )
-    save(tmp_path / "good", {"k": 1}, graph("k"))
+    assert refused(tmp_path / "good", {}) == (f"No settings 'good' in {tmp_path}. There is none.",)
+    save(tmp_path / "good", {"k": 1})
     assert refused(tmp_path / "goood.toml", {})[0].endswith("Did you mean 'good'?")
     assert refused(tmp_path / "other", {})[0].endswith("There are: good.")
 
@@ -176,7 +173,7 @@ def test_a_file_with_a_mark_of_its_byte_order_is_read(tmp_path: Path) -> None:
 def test_a_name_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name if name.startswith(("a", "x")) else name
     with pytest.raises(SettingsError):
-        save(path, {"k": 1}, graph("k"))
+        save(path, {"k": 1})
     with pytest.raises(SettingsError):
         load(path, {"k": 1})
 
@@ -185,7 +182,7 @@ def test_a_folder_that_is_missing_or_a_file_that_is_a_folder_is_refused(tmp_path
     (tmp_path / "x.toml").mkdir()
     for path in (tmp_path / "none" / "x", tmp_path / "x.toml"):
         with pytest.raises(SettingsError, match="can't be written"):
-            save(path, {"k": 1}, graph("k"))
+            save(path, {"k": 1})
     with pytest.raises(SettingsError, match="can't be read"):
         load(tmp_path / "x.toml", {})
     assert names(tmp_path) == ()
@@ -193,29 +190,29 @@ def test_a_folder_that_is_missing_or_a_file_that_is_a_folder_is_refused(tmp_path
 
 
 def test_a_save_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = save(tmp_path / "good", {"k": 1}, graph("k"))
+    file = save(tmp_path / "good", {"k": 1})
 
     def full(*_args: object) -> None:
         raise OSError("No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(SettingsError, match="No space left"):
-        save(file, {"k": 2}, graph("k"))
+        save(file, {"k": 2})
     assert load(file, {"k": 0}) == {"k": 1}
     assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_link_goes_on_naming_the_file(tmp_path: Path) -> None:
-    save(tmp_path / "v1", {"k": 1}, graph("k"))
+    save(tmp_path / "v1", {"k": 1})
     (tmp_path / "current.toml").symlink_to("v1.toml")
-    save(tmp_path / "current", {"k": 2}, graph("k"))
+    save(tmp_path / "current", {"k": 2})
     assert (tmp_path / "current.toml").is_symlink()
     assert load(tmp_path / "v1", {"k": 0}) == {"k": 2}
 
 
 def test_only_our_files_are_listed_by_name(tmp_path: Path) -> None:
     for name in ("b", "a.v2", "größe"):
-        save(tmp_path / name, {"k": 1}, graph("k"))
+        save(tmp_path / name, {"k": 1})
     (tmp_path / "pyproject.toml").write_text("[project]\nname = 'x'")
     (tmp_path / "broken.toml").write_text("= =")
     (tmp_path / "huge.toml").write_text('format = "epypes settings 1"\n[hyperparameters]\n' + "# \n" * 400_000)

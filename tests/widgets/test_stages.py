@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.stages import Stage, best_stage, stages, states
+from epypes_widgets.stages import best_stage, stages, states
 
 
 def blurred(image: Any, sigma: float) -> Any:
@@ -42,20 +42,16 @@ def runner() -> ep.CompGraphRunner:
     return runner
 
 
-def pictures(found: tuple[Stage, ...]) -> dict[str, bool]:
-    return {stage.token: stage.is_picture for stage in found}
-
-
 def test_images_and_what_was_found_in_them_have_a_picture_and_sink_tokens_are_texts(runner: Any) -> None:
     found = stages(runner.last)
-    assert list(pictures(found).items()) == [("image", True), ("blurred", True), ("corners", True), ("count", False)]
+    assert list(found.items()) == [("image", True), ("blurred", True), ("corners", True), ("count", False)]
 
 
 def test_a_picture_that_is_not_computed_now_stays(runner: Any) -> None:
     kept = stages(runner.last)
     runner.run("blurred", image=square())
     assert not runner.last.tokens.is_computed("corners")
-    assert "corners" not in pictures(stages(runner.last))
+    assert "corners" not in stages(runner.last)
     assert stages(runner.last, kept) == kept
 
 
@@ -63,12 +59,12 @@ def test_a_picture_in_which_nothing_is_found_any_more_stays(runner: Any) -> None
     kept = stages(runner.last)
     runner.run(image=np.zeros((60, 80), np.uint8))
     assert runner.last["corners"] == []
-    assert not pictures(stages(runner.last)).get("corners")
+    assert not stages(runner.last).get("corners")
     assert stages(runner.last, kept) == kept
 
 
 def test_a_token_that_is_asked_for_is_there_in_graph_order(runner: Any) -> None:
-    assert [stage.token for stage in stages(runner.last, asked="quality")] == [
+    assert [*stages(runner.last, asked="quality")] == [
         token for token in runner.cg.tokens if token in ("image", "blurred", "corners", "count", "quality")
     ]
 
@@ -76,14 +72,14 @@ def test_a_token_that_is_asked_for_is_there_in_graph_order(runner: Any) -> None:
 def test_where_nothing_has_a_picture_all_values_are_shown() -> None:
     cg = ep.CompGraph({"show": lambda text: None}, {"show": ("text", None)})
     run = ep.CompGraphRunner(cg).run(text="no picture")
-    assert pictures(stages(run)) == {"text": False}
+    assert stages(run) == {"text": False}
 
 
 def test_the_best_stage_is_a_picture_of_a_sink_token_else_the_last_picture(runner: Any) -> None:
     found = stages(runner.last)
     assert best_stage(runner.last, found) == "corners"
-    assert best_stage(runner.last, [stage for stage in found if not stage.is_picture]) == "count"
-    assert best_stage(runner.last, ()) is None
+    assert best_stage(runner.last, {"count": False}) == "count"
+    assert best_stage(runner.last, {}) is None
 
 
 def test_descriptors_come_after_the_keypoints_beside_them() -> None:

@@ -52,8 +52,8 @@ def test_every_module_is_in_a_script_once_and_no_import_is_left() -> None:
 def test_every_class_that_is_styled_is_used() -> None:
     in_python = {
         "epypes-panel", "epypes-columns", "epypes-controls", "epypes-filter", "epypes-folder", "epypes-heading",
-        "epypes-row", "epypes-name", "epypes-time", "epypes-static",
+        "epypes-row", "epypes-name", "epypes-time", "epypes-static", "epypes-contact",
     }  # fmt: skip
     styled = set(re.findall(r"\.(epypes-[a-z-]*[a-z])\b", styles()))
-    made = set(re.findall(r"epypes-[a-z-]*[a-z]\b", script())) | in_python
+    made = set(re.findall(r"epypes-[a-z-]*[a-z]\b", script() + script("picker.js"))) | in_python
     assert {name for name in styled - made if not name.startswith("epypes-channel-")} == set()

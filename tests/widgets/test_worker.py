@@ -17,7 +17,7 @@ def unexpected(exception: BaseException) -> None:
 
 @pytest.fixture
 def worker() -> Worker:
-    return Worker(unexpected)
+    return Worker(failed=unexpected)
 
 
 class Slow:
@@ -70,7 +70,7 @@ def test_what_was_wanted_before_a_request_is_always_computed(worker: Worker) -> 
 @pytest.mark.parametrize("error", [ValueError("no"), SystemExit(1)])
 def test_a_request_that_raises_is_reported_and_does_not_end_the_worker(error: BaseException) -> None:
     reported: list[BaseException] = []
-    worker = Worker(reported.append)
+    worker = Worker(failed=reported.append)
 
     def fail() -> None:
         raise error

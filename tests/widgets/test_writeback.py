@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from epypes.errors import ServiceError
-from epypes_widgets.promotion import Outcome, ReportingJob, start_write_back
+from epypes_widgets.promotion import BundleJob, Outcome
 
 TIMEOUT_S = 60.0
 DIFF = "--- pipeline.toml\n+++ pipeline.toml\n-value = 70\n+value = 60\n"
@@ -40,10 +40,10 @@ class Back:
     """Writes the values of a service back, and keeps what is reported."""
 
     def __init__(self, service: Service, told: list[Outcome]) -> None:
-        self._job, self._service = ReportingJob("epypes-write-back", told.append), service
+        self._job, self._service = BundleJob(told.append), service
 
     def start(self, *, dry_run: bool) -> bool:
-        return start_write_back(self._job, self._service.write_back, dry_run=dry_run)
+        return self._job.write_back(self._service.write_back, dry_run=dry_run)
 
     def wait(self, timeout_s: float) -> Outcome | None:
         return self._job.wait(timeout_s)
@@ -53,10 +53,12 @@ def test_a_dry_run_shows_the_differences_and_writing_tells_the_digest(told: list
     service = Service()
     back = Back(service, told)
     assert back.start(dry_run=True)
-    assert back.wait(TIMEOUT_S) == Outcome("diff", "This would change in pipeline.toml.", diff=DIFF)
+    assert back.wait(TIMEOUT_S) == Outcome("written", "diff", "This would change in pipeline.toml.", diff=DIFF)
     assert back.start(dry_run=False)
     done = back.wait(TIMEOUT_S)
-    assert done == Outcome("done", "Written to pipeline.toml and replayed; the bundle is 3f3f3f3f3f3f now.", diff=DIFF)
+    assert done == Outcome(
+        "written", "done", "Written to pipeline.toml and replayed; the bundle is 3f3f3f3f3f3f now.", diff=DIFF
+    )
     assert [each.state for each in told] == ["running", "diff", "running", "done"]
     assert service.asked == [True, False]
 
@@ -65,7 +67,7 @@ def test_without_differences_nothing_is_asked(told: list[Outcome]) -> None:
     back = Back(Service(diff=""), told)
     back.start(dry_run=True)
     done = back.wait(TIMEOUT_S)
-    assert done == Outcome("done", "pipeline.toml has these values already; the bundle is 3f3f3f3f3f3f.")
+    assert done == Outcome("written", "done", "pipeline.toml has these values already; the bundle is 3f3f3f3f3f3f.")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +80,7 @@ def test_without_differences_nothing_is_asked(told: list[Outcome]) -> None:
 def test_a_refusal_is_told(told: list[Outcome], error: Exception, text: str) -> None:
     back = Back(Service(error=error), told)
     back.start(dry_run=False)
-    assert back.wait(TIMEOUT_S) == Outcome("refused", text)
+    assert back.wait(TIMEOUT_S) == Outcome("written", "refused", text)
 
 
 def test_one_is_written_at_a_time(told: list[Outcome]) -> None:

@@ -9,9 +9,11 @@
 
 ``panel`` has the panel and ``tune``. From a control to the screen:
 
-- ``controls``: the widgets that move hyperparameters; ``control_set``: all of a panel, and which are held
+- ``controls``: the widgets that move hyperparameters, and which are held; ``scale``: the values along a slider;
+  ``column``: how they stand on the page
 - ``messages``: what is done with each message of the view
-- ``session``: what is wanted of the runner, and what it has computed; ``target``: a runner, or a running service
+- ``session``: what is wanted of a runner or a running service, and what it has computed; ``frame_states``: what the
+  frames of a sequence begin with
 - ``worker``: the thread that computes; ``tuning``: what it does
 - ``screen``: what is shown; ``frames``, ``stages``, ``histogram``: tokens of a run for the screen
 - ``view``: the script in the browser, and the frames on their way to it

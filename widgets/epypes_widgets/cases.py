@@ -7,7 +7,7 @@ is given up.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from time import monotonic
@@ -18,9 +18,8 @@ from epypes.batch.items import items_of, payload_of, read_value
 from epypes.errors import EpypesError, PayloadError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
-from epypes_widgets.history import Entry, History
-from epypes_widgets.images import Payload, payloads
-from epypes_widgets.target import Tunable
+from epypes_widgets.history import History
+from epypes_widgets.session import Tunable
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import differing
 from epypes_widgets.worker import Worker
@@ -49,13 +48,13 @@ class Cases:
     def __init__(self, runner: Tunable, cases: Checks, history: History, tuning: Tuning) -> None:
         self._runner, self._tuning = runner, tuning
         self._cases = cases if any(checks for _, checks in cases) else ()
-        self._worker = Worker(tuning.report, "epypes-cases")
+        self._worker = Worker("epypes-cases", tuning.report)
         self._lock = threading.Lock()
         self._wanted: Mapping[str, Any] | None = None
         self._over = threading.Event()
         self._has_left = False
         self._result: CheckResult | None = None
-        self._forget = history.watch(self._went_to)
+        self._forget = history.watch(lambda entry: self._want(entry.values))
 
     def begin(self) -> None:
         """Check with the values that the runner has, unless newer ones were committed."""
@@ -85,15 +84,13 @@ class Cases:
         self._over.set()
         self._worker.close(timeout_s)
 
-    def _went_to(self, entry: Entry) -> None:
+    def _want(self, committed: Mapping[str, Any]) -> None:
         now = self._runner.hyperparameters
-        self._want({**now, **{name: value for name, value in entry.values.items() if name in now}})
-
-    def _want(self, values: Mapping[str, Any]) -> None:
+        values = {name: committed.get(name, value) for name, value in now.items()}
         with self._lock:
             if self._wanted is not None and not differing(self._wanted, values):
                 return
-            self._wanted, self._result = dict(values), None
+            self._wanted, self._result = values, None
         self._request()
 
     def _request(self) -> None:
@@ -109,16 +106,16 @@ class Cases:
         own = CompGraphRunner(self._runner.cg, values, guard=getattr(self._runner, "guard", True))
         done: dict[int, tuple[CheckOutcome, ...]] = {}
         reported_s = 0.0
-        screen.send_verdicts(self._content(done))
+        screen.tell("cases", self._content(done))
         for outcomes in run_checks(own, self._cases, has_pictures=False, stop=over):
             done[outcomes[0].number] = outcomes
             if monotonic() - reported_s >= _REPORT_S:
-                screen.send_verdicts(self._content(done))
+                screen.tell("cases", self._content(done))
                 reported_s = monotonic()
             while pending("compute") and not over.wait(_LOOK_S):
                 pass
         if not over.is_set():
-            screen.send_verdicts(self._content(done))
+            screen.tell("cases", self._content(done))
             self._result = CheckResult(tuple(outcome for number in sorted(done) for outcome in done[number]))
 
     def _content(self, done: Mapping[int, tuple[CheckOutcome, ...]]) -> dict[str, Any]:
@@ -138,11 +135,6 @@ def _verdict(outcomes: tuple[CheckOutcome, ...] | None) -> dict[str, str]:
         return {"state": "passed", "text": f"{counted(len(outcomes), 'check')} passed"}
     more = f", and {counted(len(failures) - 1, 'check')} more" if len(failures) > 1 else ""
     return {"state": "failed", "text": f"{failures[0].check}: {failures[0].reason}"[:_TEXT_CHARACTERS] + more}
-
-
-def case_payloads(runner: Tunable, cases: Checks) -> Sequence[Payload]:
-    """Return the inputs of cases as what a panel can be switched to."""
-    return payloads(runner, [case.inputs for case, _ in cases], [case.name or "" for case, _ in cases])
 
 
 def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:

@@ -8,9 +8,12 @@ import keyword
 import re
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
+from functools import reduce
+from operator import or_
 from typing import Any, Final
 
-from epypes.bundle.expressions import literal_source
+from epypes.bundle.expressions import bracketed, literal_source
 from epypes_widgets.values import differing, listed
 
 # A longer text of one value is for a file, not for a line.
@@ -63,7 +66,10 @@ def line(
 
 def source(value: Any, param: object = None) -> str:
     """Return the expression of a value; "" if there is no short one."""
-    text = _constant(value, param) or _expression(value)
+    try:
+        text = _constant(value, param) or _expression(value)
+    except (ValueError, RecursionError):
+        return ""
     return text if len(text) <= _MAX_CHARACTERS else ""
 
 
@@ -95,42 +101,34 @@ def _is_name(name: str) -> bool:
 
 def _constant(value: Any, param: object) -> str:
     """Return a choice by its label, if that is the name of a constant, or of several that are joined by + or |."""
-    choices, labels = getattr(param, "choices", None), getattr(param, "labels", None)
-    cv2 = sys.modules.get("cv2")
-    if not choices or not labels or cv2 is None or type(value) is not int:
-        return ""
+    choices, labels = getattr(param, "choices", None) or (), getattr(param, "labels", None) or ()
     label = next((label for choice, label in zip(choices, labels, strict=False) if choice == value), "")
     names = [part.strip().removeprefix("cv2.") for part in re.split(r"[+|]", label)]
-    constants = [vars(cv2).get(name) for name in names]
-    total = 0
-    for constant in constants:
-        if type(constant) is not int:
-            return ""
-        total |= constant
-    return " | ".join(f"cv2.{name}" for name in names) if total == value else ""
+    constants = [getattr(sys.modules.get("cv2"), name, None) for name in names]
+    if type(value) is not int or any(type(constant) is not int for constant in constants):
+        return ""
+    return " | ".join(f"cv2.{name}" for name in names) if reduce(or_, constants) == value else ""
 
 
 def _expression(value: Any) -> str:
+    """Return the expression of a value; ValueError if there is none."""
     if isinstance(value, enum.Enum):
         parts = (value.name or "").split("|")  # the parts of a flag have names of their own
-        known = type(value).__members__
-        return " | ".join(f"{type(value).__name__}.{part}" for part in parts) if known.keys() >= set(parts) else ""
-    if type(value) in (tuple, list):
-        return _sequence(value)
-    if type(value) is float and not literal_source(value):
-        return f'float("{value!r}")'
-    return _numpy_scalar(value) or literal_source(value)
-
-
-def _sequence(values: tuple[Any, ...] | list[Any]) -> str:
-    parts = [_expression(item) for item in values[:_MAX_CHARACTERS]]
-    if len(parts) < len(values) or not all(parts):
-        return ""
-    inner = ", ".join(parts)
-    return f"[{inner}]" if isinstance(values, list) else f"({inner},)" if len(parts) == 1 else f"({inner})"
+        if not type(value).__members__.keys() >= set(parts):
+            raise ValueError(f"{value!r} has no name")
+        return " | ".join(f"{type(value).__name__}.{part}" for part in parts)
+    if type(value) in (tuple, list, dict):
+        if len(value) > _MAX_CHARACTERS:
+            raise ValueError("too many items")
+        return bracketed(value, _expression)
+    text = _numpy_scalar(value) or literal_source(value) or (f'float("{value!r}")' if type(value) is float else "")
+    if not text:
+        raise ValueError(f"no text makes a {type(value).__name__}")
+    return text
 
 
 def _numpy_scalar(value: Any) -> str:
+    """Return the call that makes a number of NumPy; "" for anything else."""
     numpy = sys.modules.get("numpy")
     if numpy is None or not isinstance(value, numpy.number | numpy.bool_):
         return ""
@@ -138,11 +136,8 @@ def _numpy_scalar(value: Any) -> str:
     # NumPy 2 calls its bool "bool", NumPy 1 does not know that name.
     name = "bool_" if kind is numpy.bool_ else kind.__name__
     for text in (str(value), f'"{value!s}"'):
-        try:
-            again = kind(ast.literal_eval(text))
-        except (ValueError, SyntaxError, TypeError):
-            continue
         # By their texts, which are exact, and tell -0.0 from 0.0: a long double has bytes that mean nothing.
-        if repr(again) == repr(value):
-            return f"np.{name}({text})"
+        with suppress(ValueError, SyntaxError, TypeError):
+            if repr(kind(ast.literal_eval(text))) == repr(value):
+                return f"np.{name}({text})"
     return ""

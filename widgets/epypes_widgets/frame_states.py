@@ -7,18 +7,19 @@ another frame runs those since the last checkpoint. They count as long as nothin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from time import monotonic
 from typing import Any, Final
 
+from epypes.batch.cache import NoDigest, value_digest
 from epypes.batch.grid import identity
 from epypes.errors import ImageFileError
 from epypes.graph import subgraph
 from epypes.run import CompGraphRunner, Run
-from epypes.run.guard import is_array, is_plain_array
+from epypes.run.guard import is_array
 from epypes.run.program import INITIAL_STATE, REVISION
-from epypes_widgets.images import Payload
+from epypes_widgets.images import Payloads
 
 State = Mapping[str, Any]
 
@@ -65,13 +66,10 @@ def _nbytes(state: State) -> int:
 
 def _identity(value: Any) -> object:
     """Return what is equal for values with which a function computes the same, as far as that can be seen."""
-    if is_plain_array(value) and not value.dtype.hasobject:
-        return value.shape, value.dtype, value.tobytes()
-    if type(value) in (list, tuple):
-        return type(value), *map(_identity, value)
-    if type(value) is dict:
-        return dict, *((key, _identity(item)) for key, item in value.items())
-    return identity(value)
+    try:
+        return value_digest(value)
+    except NoDigest:
+        return identity(value)
 
 
 class FrameStates:
@@ -90,7 +88,7 @@ class FrameStates:
         The tokens from which the state is taken.
     """
 
-    def __init__(self, runner: CompGraphRunner, payloads: Sequence[Payload]) -> None:
+    def __init__(self, runner: CompGraphRunner, payloads: Payloads) -> None:
         self._runner, self._payloads = runner, payloads
         cg = runner.cg
         self._initial: State = dict(CompGraphRunner(cg, runner.hyperparameters, guard=runner.guard).state)
@@ -151,17 +149,21 @@ class FrameStates:
         for old in list(self._known)[:-_MOST_KEPT]:
             del self._known[old]
         place, state = known.nearest(frame)
-        first, reported_s = place, monotonic()
-        while place < frame:
-            if is_superseded():
-                raise Superseded
-            # A frame that can't be read leaves the state as it was, as one on which a function fails does.
-            with suppress(ImageFileError):
-                payload = self._payloads[place].values
-                state = self._runner.trial(values, *self.targets, payload=payload, state=state).state
-            place += 1
-            known.add(place, state)
-            if monotonic() - reported_s >= _REPORT_S:
-                report(f"Running the frames before this one: {place - first} of {frame - first}")
-                reported_s = monotonic()
+        first, begun_s, reports = place, monotonic(), 0
+        try:
+            while place < frame:
+                if is_superseded():
+                    raise Superseded
+                # A frame that can't be read leaves the state as it was, as one on which a function fails does.
+                with suppress(ImageFileError):
+                    payload = self._payloads[place].values
+                    state = self._runner.trial(values, *self.targets, payload=payload, state=state).state
+                place += 1
+                known.add(place, state)
+                if monotonic() - begun_s >= _REPORT_S * (reports + 1):
+                    reports += 1
+                    report(f"Running the frames before this one: {place - first} of {frame - first}")
+        finally:
+            if reports:
+                report("")
         return state

@@ -121,8 +121,7 @@ def picture(
     found = scene(run, token, had_marks=token in had_pictures)
     described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
     if found is None:
-        text = _text_in_place(run, token)
-        return {**described, "media_type": "text/plain", "text": text}, b""
+        return {**described, "media_type": "text/plain", "text": _text_in_place(run, token)}, b""
     image = found.backdrop.image
     encoded = encode_image(image, max_side_px, found.backdrop.order, found.backdrop.ends)
     described |= {
@@ -143,7 +142,11 @@ def _text_in_place(run: Run, token: str) -> str:
     """Return what stands in the place of a picture."""
     if token not in run:
         return f"{token} has not been computed with these values."
-    return f"{token}: nothing found." if run.tokens.is_nothing(token) else text_of(run[token])
+    if run.tokens.is_nothing(token):
+        return f"{token}: nothing found."
+    short = reprlib.Repr()
+    short.maxother = short.maxstring = _MAX_TEXT
+    return short.repr(run[token])
 
 
 def _order_text(run: Run, backdrop: Backdrop) -> str:
@@ -152,13 +155,6 @@ def _order_text(run: Run, backdrop: Backdrop) -> str:
         return ""
     is_assumed = run.cg.has_token(backdrop.name) and backdrop.name not in run.cg.colours
     return backdrop.order + ", assumed" * is_assumed
-
-
-def text_of(value: Any) -> str:
-    """Return a value as a short text."""
-    short = reprlib.Repr()
-    short.maxother = short.maxstring = _MAX_TEXT
-    return short.repr(value)
 
 
 def still_picture(run: Run, token: str, max_side_px: int, most_bytes: int) -> Picture | None:

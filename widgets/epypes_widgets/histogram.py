@@ -54,7 +54,8 @@ def histogram(seen: Backdrop) -> dict[str, Any]:
     kind = image_kind(image, sampled(image))
     if kind == "mask":
         return _of_mask(image)
-    sample = _sample(image)
+    stride = max(1, math.ceil(math.sqrt(image.shape[0] * image.shape[1] / MOST_PX)))
+    sample = image[::stride, ::stride]
     with silent_numpy():
         low, high = _ends(sample, seen.ends, kind)
         bins = _bins(sample, low, high, kind)
@@ -81,11 +82,6 @@ def _of_mask(mask: Array) -> dict[str, Any]:
     # A mask without any pixel set does not tell what would be set: in OpenCV that is 255.
     white = 1 if mask.dtype.kind == "b" or (set_px and int(mask.max()) == 1) else 255
     return _plain(0, white, {"gray": [mask.size - set_px, set_px]}, False)
-
-
-def _sample(image: Array) -> Array:
-    stride = math.ceil(math.sqrt(image.shape[0] * image.shape[1] / MOST_PX))
-    return image[:: max(stride, 1), :: max(stride, 1)]
 
 
 def _ends(sample: Array, shown: tuple[float, float], kind: str) -> tuple[float, float]:

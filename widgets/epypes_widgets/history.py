@@ -18,7 +18,7 @@ from epypes.display import Picture
 from epypes.optional import optional_import
 from epypes.store import Store, opened_store
 from epypes.store.writer import SeriesWriter
-from epypes_widgets.target import Tunable
+from epypes_widgets.session import Tunable
 from epypes_widgets.values import change_text, differing, json_value
 
 if TYPE_CHECKING:
@@ -89,10 +89,8 @@ class History:
     """
 
     def __init__(self, limit: int = _MAX_ENTRIES) -> None:
-        if type(limit) is not int or limit < 1:
-            raise ValueError(f"limit is how many entries are kept, 1 or more, not {limit!r}.")
         self.limit = limit
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._entries: tuple[Entry, ...] = ()
         self._path: tuple[Entry, ...] = ()
         self._place = -1
@@ -126,13 +124,15 @@ class History:
             None if values and image are those of the current entry: nothing is added then.
         """
         with self._lock:
-            current = self._current()
+            current = self.current
             if current is not None and current.image == image and not differing(current.values, values):
                 return None
-            kept = MappingProxyType({name: _copy(value) for name, value in values.items()})
+            # The user may write to a list or dict later.
+            mutable = (list, dict, set)
+            kept = {name: copy.copy(value) if type(value) in mutable else value for name, value in values.items()}
             self._committed += 1
             now = datetime.now().astimezone().replace(microsecond=0)
-            entry = Entry(self._committed, kept, now, image=image, **about)
+            entry = Entry(self._committed, MappingProxyType(kept), now, image=image, **about)
             self._entries = (*self._entries, entry)[-self.limit :]
             oldest = self._entries[0].number
             walked = self._path[: self._place + 1]
@@ -170,7 +170,7 @@ class History:
     def current(self) -> Entry | None:
         """The entry that was committed or gone to last; None before the first."""
         with self._lock:
-            return self._current()
+            return self._path[self._place] if self._path else None
 
     @property
     def can_undo(self) -> bool:
@@ -201,14 +201,6 @@ class History:
 
     def __len__(self) -> int:
         return len(self._entries)
-
-    def __repr__(self) -> str:
-        count, current = len(self._entries), self.current
-        at = f"; at {current.number}" if current is not None else ""
-        return f"<History: {count} entr{'y' if count == 1 else 'ies'}{at}>"
-
-    def _current(self) -> Entry | None:
-        return self._path[self._place] if self._path else None
 
     def _step(self, by: int) -> Entry | None:
         with self._lock:
@@ -244,11 +236,6 @@ def changed(before: Entry | None, after: Entry, frames: Sequence[int] | None = N
     )
     moved = f"{'image' if frames is None else 'frame'} {one} -> {other}" if one != other else ""
     return ", ".join(filter(None, (change_text(before.values, after.values), moved)))
-
-
-def _copy(value: Any) -> Any:
-    """Return a list or dict as a copy, which the user does not write to later."""
-    return copy.copy(value) if type(value) in (list, dict, set) else value
 
 
 # The prefix of the row keys of a history: the entries of every history count from 1.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import is_
 from pathlib import Path, PurePath
-from typing import Any, Final, overload
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.acquisition.files import is_video_name
 from epypes.acquisition.frames import with_images
@@ -17,7 +18,9 @@ from epypes.graph import colour_order
 from epypes.images import Order
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array
-from epypes_widgets.target import Tunable
+
+if TYPE_CHECKING:
+    from epypes_widgets.session import Tunable
 
 _THUMBNAIL_PX: Final = 96
 _THUMBNAIL_BYTES: Final = 5_000
@@ -43,7 +46,60 @@ class Payload:
     thumbnail: bytes = field(default=b"", repr=False)
 
 
-class VideoPayloads(Sequence[Payload]):
+class Payloads:
+    """The payloads that a panel can be switched to: single images, or the frames of a sequence.
+
+    Parameters
+    ----------
+    payloads
+        In the order in which they are listed.
+    is_sequence
+        Whether they are frames, which have a slider and numbers.
+
+    Attributes
+    ----------
+    numbers
+        The numbers of the frames; None of single images.
+    name
+        The name of the video; empty if it is none.
+    """
+
+    numbers: range | None = None
+    name = ""
+
+    def __init__(self, payloads: Iterable[Payload] = (), *, is_sequence: bool = False) -> None:
+        self._payloads = tuple(payloads)
+        if is_sequence:
+            self.numbers = range(len(self._payloads))
+
+    @property
+    def inputs(self) -> Any:
+        """The values, as a search takes them."""
+        return [payload.values for payload in self._payloads]
+
+    def title(self, index: int) -> str:
+        """Return what a payload is called; nothing is read."""
+        return self._payloads[index].title
+
+    def time_s(self, index: int) -> float | None:
+        """Return the time of a frame of a video in s."""
+        return None
+
+    def index_of(self, values: Mapping[str, Any], is_one: Callable[[Any, Any], bool] = is_) -> int | None:
+        """Return the index of the payload that has these values, by token; None if none has."""
+        for index, payload in enumerate(self._payloads):
+            if all(is_one(values[token], value) for token, value in payload.values.items()):
+                return index
+        return None
+
+    def __len__(self) -> int:
+        return len(self._payloads)
+
+    def __getitem__(self, index: int) -> Payload:
+        return self._payloads[index]
+
+
+class VideoPayloads(Payloads):
     """The frames of a video as payloads, each read when it is asked for.
 
     Parameters
@@ -57,31 +113,36 @@ class VideoPayloads(Sequence[Payload]):
     """
 
     def __init__(self, video: Video, token: str, order: Order) -> None:
-        self.video, self._token, self._order = video, token, order
+        self._video, self._token, self._order = video, token, order
+        self._numbers = self.numbers = video.numbers
+        self.name = video.path.name
+
+    @property
+    def inputs(self) -> Any:
+        """The video."""
+        return self._video
 
     def title(self, index: int) -> str:
         """Return what a frame is called; it is not read."""
-        return f"{self.video.path.name} #{self.video.numbers[index]}, {self.video.time_s(index):.3f} s"
+        return f"{self.name} #{self._numbers[index]}, {self._video.time_s(index):.3f} s"
 
-    def index_of(self, image: object) -> int | None:
-        """Return the index of the frame that an array was read from; None if it was from none of these."""
-        number = self.video.number_of(image)
-        return None if number is None or number not in self.video.numbers else self.video.numbers.index(number)
+    def time_s(self, index: int) -> float:
+        """Return the time of a frame in s."""
+        return self._video.time_s(index)
+
+    def index_of(self, values: Mapping[str, Any], is_one: Callable[[Any, Any], bool] = is_) -> int | None:
+        """Return the index of the frame whose array this is: to compare pixels, all frames would have to be decoded."""
+        number = self._video.number_of(values[self._token])
+        return None if number is None or number not in self._numbers else self._numbers.index(number)
 
     def __len__(self) -> int:
-        return len(self.video)
+        return len(self._numbers)
 
-    @overload
-    def __getitem__(self, index: int) -> Payload: ...
-    @overload
-    def __getitem__(self, index: slice) -> VideoPayloads: ...
-    def __getitem__(self, index: int | slice) -> Payload | VideoPayloads:
-        if isinstance(index, slice):
-            return VideoPayloads(self.video[index], self._token, self._order)
-        return Payload(self.title(index), {self._token: self.video.image(self.video.numbers[index], self._order)})
+    def __getitem__(self, index: int) -> Payload:
+        return Payload(self.title(index), {self._token: self._video.image(self._numbers[index], self._order)})
 
 
-def payloads(runner: Tunable, images: Any, titles: Sequence[str] = ()) -> Sequence[Payload]:
+def payloads(runner: Tunable, images: Any, titles: Sequence[str] = ()) -> Payloads:
     """Return what ``tune(runner, images=...)`` was given as payloads.
 
     Parameters
@@ -117,13 +178,16 @@ def payloads(runner: Tunable, images: Any, titles: Sequence[str] = ()) -> Sequen
     values = [_values(runner, free, item, f"images[{place}]") for place, item in enumerate(given)]
     # Frames of a sequence have a slider, and no pictures to choose among.
     is_sequence = isinstance(runner, CompGraphRunner) and bool(runner.state)
-    return tuple(
-        Payload(
-            titles[place] if titles else _title(payload, place),
-            payload,
-            b"" if is_sequence else _thumbnail(runner, payload),
-        )
-        for place, payload in enumerate(values)
+    return Payloads(
+        (
+            Payload(
+                titles[place] if titles else _title(payload, place),
+                payload,
+                b"" if is_sequence else _thumbnail(runner, payload),
+            )
+            for place, payload in enumerate(values)
+        ),
+        is_sequence=is_sequence,
     )
 
 

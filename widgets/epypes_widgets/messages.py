@@ -7,20 +7,22 @@ but a probe, which reads a pixel of pictures that are there.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.cases import Cases
 from epypes_widgets.frames import scene
-from epypes_widgets.promotion import Outcome, ReportingJob, start_promotion, start_write_back
+from epypes_widgets.promotion import BundleJob, Outcome
 from epypes_widgets.screen import Comparison
-from epypes_widgets.search import Search
 from epypes_widgets.stages import probe
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.view import Handler, Message
+
+if TYPE_CHECKING:
+    from epypes_widgets.panel import Panel
 
 
 class Messages:
@@ -28,29 +30,18 @@ class Messages:
 
     Parameters
     ----------
+    panel
+        Saves, loads, searches and writes back.
     tuning
-        Does what they ask for.
+        Does what else they ask for.
     cases
         Need to know whether there is a view.
-    save, load, write_back
-        Write the present values to a file, set those of one, and write them into the bundle of the service.
-    search
-        Of hyperparameters; None if there is no metric.
     """
 
-    def __init__(
-        self,
-        tuning: Tuning,
-        cases: Cases,
-        save: Callable[[str], Path],
-        load: Callable[[str], None],
-        write_back: Callable[[bool], Any],
-        search: Search | None,
-    ) -> None:
-        self._tuning, self._screen, self._cases, self._search = tuning, tuning.screen, cases, search
-        self._save, self._load = save, load
-        self._write_back, self._promotion = write_back, ReportingJob("epypes-promotion", self._promoted)
-        self._writing = ReportingJob("epypes-write-back", self._written)
+    def __init__(self, panel: Panel, tuning: Tuning, cases: Cases) -> None:
+        self._panel, self._tuning, self._cases, self._screen = panel, tuning, cases, tuning.screen
+        self._bundle_job = BundleJob(self._show_outcome)
+        search = panel.search
         if search is not None:
             search.report = lambda: self._screen.view.tell("optimised", search.content())
 
@@ -66,7 +57,7 @@ class Messages:
             "release": lambda _: tuning.release(),
             "set": lambda message: self._set(message["values"]),
             "move": self._move,
-            "reset": self._reset,
+            "reset": lambda message: self._set(tuning.first_values(message["names"])),
             "live": self._live,
             "run": lambda _: tuning.run(),
             "image": lambda message: tuning.want_image(int(message["index"])),
@@ -78,22 +69,11 @@ class Messages:
             "undo": lambda _: tuning.go_to(tuning.history.undo),
             "redo": lambda _: tuning.go_to(tuning.history.redo),
             "goto": lambda message: tuning.go_to(lambda: tuning.history.goto(int(message["number"]))),
-            "save": lambda message: self._file(message, lambda name: f"Saved {self._save(name).name}."),
+            "save": lambda message: self._file(message, self._saved),
             "load": lambda message: self._file(message, self._loaded),
             "promote": self._promote,
-            "write_back": self._start_write_back,
-            **self._search_handlers,
-        }
-
-    @property
-    def _search_handlers(self) -> dict[str, Handler]:
-        search = self._search
-        if search is None:
-            return {}
-        return {
-            "optimise": lambda message: search.start(int(message["n"])),
-            "optimise_stop": lambda _: search.stop(),
-            "optimise_use": lambda _: self._set(search.best.setting if search.best else {}, by_user=False),
+            "write_back": self._write_back,
+            **dict.fromkeys(("optimise", "optimise_stop", "optimise_use"), self._optimise),
         }
 
     def _ready(self, _message: Message) -> None:
@@ -109,10 +89,9 @@ class Messages:
     # -- values -------------------------------------------------------------------------------------------------
 
     def _set(self, values: Mapping[str, Any], *, commit: bool = True, by_user: bool = True) -> None:
-        if not values:
-            return
         try:
-            self._tuning.want(values, commit=commit, by_user=by_user)
+            if values:
+                self._tuning.want(values, commit=commit, by_user=by_user)
         except ValueError as error:
             self._screen.fail(str(error), names=tuple(values))
 
@@ -122,13 +101,20 @@ class Messages:
         if "image" in message:
             self._tuning.want_image(int(message["image"]), commit=False)
 
-    def _reset(self, message: Message) -> None:
-        first, controls = self._tuning.runner.first_hyperparameters, self._tuning.controls.values
-        self._set({n: first[n] for n in message["names"] or controls if n in first and n in controls})
-
     def _live(self, message: Message) -> None:
         self._tuning.is_live = bool(message["on"])
         self._tuning.run()
+
+    def _optimise(self, message: Message) -> None:
+        search = self._panel.search
+        if search is None:
+            return
+        if message["kind"] == "optimise":
+            search.start(int(message["n"]))
+        elif message["kind"] == "optimise_stop":
+            search.stop()
+        elif search.best is not None:
+            self._set(search.best.setting, by_user=False)
 
     # -- looking ------------------------------------------------------------------------------------------------
 
@@ -163,26 +149,28 @@ class Messages:
             text, is_done = str(error), False
         self._screen.view.tell("settings", {"names": list(settings.names(".")), "text": text, "ok": is_done})
 
+    def _saved(self, name: str) -> str:
+        return f"Saved {self._panel.save(name).name}."
+
     def _loaded(self, name: str) -> str:
-        self._load(name)
+        self._panel.load(name)
         return f"Loaded {name}."
 
     def _promote(self, message: Message) -> None:
         runner, to = self._tuning.runner, str(message["to"])
         if isinstance(runner, CompGraphRunner):
-            start_promotion(self._promotion, runner, to)
+            self._bundle_job.promote(runner, to)
         else:
             text = "Not promoted: a running service is a bundle already. Write its values back."
-            self._promoted(Outcome("refused", text, to))
+            self._show_outcome(Outcome("promoted", "refused", text, to))
 
-    def _start_write_back(self, message: Message) -> None:
+    def _write_back(self, message: Message) -> None:
         if self._tuning.session.is_service:
-            start_write_back(self._writing, self._write_back, dry_run=bool(message["dry_run"]))
+            self._bundle_job.write_back(self._panel.write_back, dry_run=bool(message["dry_run"]))
         else:
-            self._written(Outcome("refused", "Not written: a runner has no bundle to write to. Promote it."))
+            text = "Not written: a runner has no bundle to write to. Promote it."
+            self._show_outcome(Outcome("written", "refused", text))
 
-    def _promoted(self, outcome: Outcome) -> None:
-        self._screen.view.tell("promoted", {"state": outcome.state, "text": outcome.text, "to": outcome.to})
-
-    def _written(self, outcome: Outcome) -> None:
-        self._screen.view.tell("written", {"state": outcome.state, "text": outcome.text, "diff": outcome.diff})
+    def _show_outcome(self, outcome: Outcome) -> None:
+        content = asdict(outcome)
+        self._screen.view.tell(content.pop("kind"), content)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,18 +15,17 @@ from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
 from epypes.store import Store
 from epypes_widgets import code, settings
-from epypes_widgets.cases import Cases, case_payloads, read_cases
-from epypes_widgets.control_set import ControlSet
-from epypes_widgets.controls import column, controls
+from epypes_widgets.cases import Cases, read_cases
+from epypes_widgets.column import column
+from epypes_widgets.controls import ControlSet, controls
 from epypes_widgets.history import StoredHistory, history_of
-from epypes_widgets.images import Payload, VideoPayloads, payloads
+from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
-from epypes_widgets.search import Search, search_of
-from epypes_widgets.session import Session
-from epypes_widgets.static import StaticOutput, static_html
-from epypes_widgets.target import tunable
+from epypes_widgets.search import Search
+from epypes_widgets.session import Session, tunable
+from epypes_widgets.static import Displayed, StaticOutput, static_html
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
     from epypes_widgets.history_table import HistoryTable
 
 
-class Panel:
+class Panel(Displayed):
     """Controls and a picture, bound to a runner; made by ``tune``.
 
     Values may be set from any thread. They are computed on a thread of the panel's own, the latest first; a cell that
@@ -85,7 +84,7 @@ class Panel:
         cg: CompGraph = self._runner.cg
         self._history = history_of(self._runner)
         self._column = column(cg, controls.controls)
-        self._worker = worker = Worker(self._report)
+        self._worker = worker = Worker(failed=self._report)
         view = PictureView(
             lambda key, request, delay_s: worker.post(key, request, delay_s, is_work=False), self._report
         )
@@ -97,8 +96,7 @@ class Panel:
             self._stored = StoredHistory(self._runner, store, name, self._history, self._screen.log)
         self._tuning = Tuning(controls, session, self._history, worker, self._screen, self._static.update)
         self._cases = Cases(self._runner, cases, self._history, self._tuning)
-        messages = Messages(self._tuning, self._cases, self.save, self.load, self.write_back, search)
-        view.handlers = messages.handlers
+        view.handlers = Messages(self, self._tuning, self._cases).handlers
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         use_subshell(self._widget)
@@ -133,10 +131,7 @@ class Panel:
 
     def reset(self, /, *names: str) -> None:
         """Set hyperparameters to the values that the runner had them frozen with; all without names."""
-        first = self._runner.first_hyperparameters
-        for name in names:
-            self._controls.control(name)
-        self.set(**{name: first[name] for name in names or self.values if name in first})
+        self.set(**self._tuning.first_values(names))
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""
@@ -243,7 +238,7 @@ class Panel:
         SettingsError
             With every reason why not.
         """
-        return settings.save(path, self._controls.movable, self._runner.cg, self._controls.params)
+        return settings.save(path, self._controls.movable, self._controls.params)
 
     def load(self, path: str | Path) -> None:
         """Set the values that are in a TOML file, all or none.
@@ -323,32 +318,28 @@ class Panel:
         shows = "" if self.token is None else f", shows {self.token!r:.30}"
         return f"<Panel: {len(self.values)} hyperparameters{shows}; {state}>"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
-        bundle: dict[str, Any] = self._widget._repr_mimebundle_() or {}
-        return {**bundle, "text/plain": repr(self)}
-
-    def _ipython_display_(self) -> None:
-        from IPython.display import display
-
-        display(self._repr_mimebundle_(), raw=True)
-        self._static.display()
-
     def _static_html(self) -> str:
         run = self._session.result
         if run is None:
             return ""
         first = self._runner.first_hyperparameters
-        return static_html(run, self.token, run.hyperparameters, first, image=self._session.title, code=self.code())
+        image = self._session.image
+        title = "" if image is None else self._session.payloads.title(image)
+        return static_html(run, self.token, run.hyperparameters, first, image=title, code=self.code())
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
-        frames, values = self._session.frames, json_values(self.values)
-        images = self._session.payloads if frames is None else ()
+        values, payloads = json_values(self.values), self._session.payloads
+        numbers, frames = payloads.numbers, None
+        if numbers is not None:
+            counted = {"start": numbers.start, "step": numbers.step, "count": len(numbers)}
+            frames = {"name": payloads.name, "numbers": counted}
+        images = [payloads[index] for index in range(len(payloads))] if numbers is None else []
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
             "images": [{"index": index, "title": image.title} for index, image in enumerate(images)],
-            "frames": None if frames is None else {"name": self._session.frames_name, "numbers": _ends(frames)},
+            "frames": frames,
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._controls.thresholds.items()],
             "rois": [
@@ -364,11 +355,6 @@ class Panel:
         return content, [image.thumbnail for image in images]
 
 
-def _ends(numbers: range) -> dict[str, int]:
-    """Return the numbers of frames as the view gets them."""
-    return {"start": numbers.start, "step": numbers.step, "count": len(numbers)}
-
-
 def _made_from(cg: CompGraph, token: str) -> list[str]:
     """Return the tokens that depend on a token: on a picture that it has cut out, it means something else."""
     found = {token}
@@ -376,12 +362,6 @@ def _made_from(cg: CompGraph, token: str) -> list[str]:
         if found.intersection(cg.func_inputs(function)):
             found.update(cg.func_outputs(function))
     return sorted(found)
-
-
-def _searched(given: Sequence[Payload], *, is_series: bool) -> Any:
-    """Return the inputs that a search looks at, of a graph with state those of one case; None without any."""
-    inputs = given.video if isinstance(given, VideoPayloads) else [payload.values for payload in given]
-    return ([inputs] if is_series else inputs) if len(inputs) else None
 
 
 def tune(
@@ -473,17 +453,21 @@ def tune(
     if token is not None:
         runner.cg.require_token(token)
     found = read_cases(runner, images, cases)
-    given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
-    has_state = isinstance(runner, CompGraphRunner) and bool(runner.state)
+    if found:
+        given = payloads(runner, [case.inputs for case, _ in found], [case.name or "" for case, _ in found])
+    else:
+        given = Payloads() if images is None else payloads(runner, images)
     session = Session(runner, given)
-    if session.is_service and given:
+    if session.is_service and len(given):
         runner.trial({}, payload=given[0].values)  # refuses it
-    elif runner.last is None and not given and not session.is_service:
+    elif runner.last is None and not len(given) and not session.is_service:
         free = runner.free_source_tokens
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
     control_set = ControlSet(controls(runner, hints))
-    looked_at = [case for case, _ in found] or _searched(given, is_series=has_state)
-    search = search_of(runner, metric, direction, looked_at, lambda: control_set.params)
+    looked_at: Any = [case for case, _ in found] or (given.inputs if len(given) else None)
+    if looked_at is not None and session.states is not None:
+        looked_at = [looked_at]  # the frames of one case
+    search = None if metric is None else Search(runner, metric, direction, looked_at, control_set.params)
     session.begin()
     return Panel(control_set, session, token, found, store, name, search)

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import anywidget
 
-from epypes.batch.contact_sheet import Block, Sheet, Tile, sheet_page, shown_tokens
+from epypes.batch.contact_sheet import Sheet, Tile, sheet_page, shown_tokens
 from epypes.batch.grid import identity
 from epypes.batch.mapping import SweepResult
 from epypes.display.text import cut
 from epypes.errors import EpypesError
-from epypes_widgets.static import StaticOutput
+from epypes_widgets.static import Displayed, StaticOutput
 from epypes_widgets.values import is_same, setting_text
 from epypes_widgets.view import script, styles, use_subshell
 from epypes_widgets.worker import Worker
@@ -35,7 +35,7 @@ class SheetView(anywidget.AnyWidget):
     """The contact sheet in the browser; to the kernel it sends ``ready``, ``pick`` and ``show``."""
 
     _esm = script("picker.js")
-    _css = styles("picker.css")
+    _css = styles()
 
 
 def pick(result: SweepResult, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Picker:
@@ -61,7 +61,7 @@ def pick(result: SweepResult, token: str | None = None, rows: str | None = None,
     return Picker(result, result.sheet(token, rows, columns))
 
 
-class Picker:
+class Picker(Displayed):
     """A contact sheet that is clicked; made by ``pick``.
 
     Attributes
@@ -77,7 +77,7 @@ class Picker:
         self._clicked: int | None = None
         self._text = ""
         self._is_seen = False
-        self._worker = Worker(self._failed, "epypes-pick")
+        self._worker = Worker("epypes-pick", self._failed)
         self._static = StaticOutput(lambda: sheet_page(self._sheet, self.chosen))
         self._view = SheetView()
         self._view.on_msg(self._answer)
@@ -201,7 +201,11 @@ class Picker:
     def _tell_sheet(self) -> None:
         shown = self._sheet.first(_MAX_TILES)
         pictures: dict[bytes, int] = {}
-        blocks = [_block(block, self.result, pictures) for block in shown.blocks]
+        tiles = partial(_tile, self.result, pictures)
+        blocks = [
+            {"title": block.title, "rows": [[[*map(tiles, cell)] for cell in row] for row in block.rows]}
+            for block in shown.blocks
+        ]
         content = {
             "kind": "sheet",
             "token": self._sheet.token,
@@ -221,25 +225,9 @@ class Picker:
     def __repr__(self) -> str:
         return f"<Picker: {len(self.result)} outcomes of {', '.join(self.result.names):.40}; chosen: {self.chosen}>"
 
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
-        shown = self._view._repr_mimebundle_()
-        bundle: dict[str, Any] = (shown[0] if isinstance(shown, tuple) else shown) or {}
-        return {**bundle, "text/plain": repr(self)}
 
-    def _ipython_display_(self) -> None:
-        from IPython.display import display
-
-        display(self._repr_mimebundle_(), raw=True)
-        self._static.display()
-
-
-def _block(block: Block, result: SweepResult, pictures: dict[bytes, int]) -> dict[str, Any]:
-    """Return a block as the view knows it; ``pictures`` gets those that are not in it."""
-    rows = [[[_tile(tile, result, pictures) for tile in cell] for cell in row] for row in block.rows]
-    return {"title": block.title, "rows": rows}
-
-
-def _tile(tile: Tile, result: SweepResult, pictures: dict[bytes, int]) -> dict[str, Any]:
+def _tile(result: SweepResult, pictures: dict[bytes, int], tile: Tile) -> dict[str, Any]:
+    """Return a tile as the view knows it; ``pictures`` gets its picture if that is not in it."""
     shown = tile.thumbnail
     return {
         "place": tile.place,

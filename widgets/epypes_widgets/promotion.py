@@ -1,8 +1,7 @@
-"""Promotion by a button, and the values of a service written back: one job at a time, on a thread of its own."""
+"""What is done with the bundle of a panel: promotion by a button, and the values of a service written back into it."""
 
 from __future__ import annotations
 
-import logging
 import re
 import threading
 from collections.abc import Callable, Sequence
@@ -15,52 +14,11 @@ from epypes.errors import EpypesError, PromotionRefused
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 from epypes_widgets.values import listed
+from epypes_widgets.worker import Worker
 
-_LOG: Final = logging.getLogger(__name__)
 _NOT_IN_A_NAME: Final = re.compile(r"[^\w.-]+")
 _DIFF_CHARACTERS: Final = 20_000
 _DIGEST_CHARACTERS: Final = 12
-
-
-class Job:
-    """Work on a thread of its own, one at a time.
-
-    Parameters
-    ----------
-    name
-        Of the thread.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._lock = threading.Lock()
-        self._ended = threading.Event()
-        self._ended.set()
-
-    @property
-    def is_running(self) -> bool:
-        """Whether work has begun and not ended."""
-        return not self._ended.is_set()
-
-    def run(self, work: Callable[[], object]) -> bool:
-        """Begin work and return at once; False, and nothing else, if some is running."""
-        with self._lock:
-            if self.is_running:
-                return False
-            self._ended.clear()
-        threading.Thread(target=self._work, args=(work,), name=self._name, daemon=True).start()
-        return True
-
-    def wait_end(self, timeout_s: float) -> None:
-        """Return once nothing is running; TimeoutError if that takes longer."""
-        if not self._ended.wait(timeout_s):
-            raise TimeoutError(f"{self._name} did not end within {timeout_s:g} s.")
-
-    def _work(self, work: Callable[[], object]) -> None:
-        try:
-            work()
-        finally:
-            self._ended.set()
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +27,8 @@ class Outcome:
 
     Attributes
     ----------
+    kind
+        ``"promoted"`` or ``"written"``: which of the two.
     state
         ``"running"``, ``"diff"`` when it is shown what would change, ``"done"`` or ``"refused"``.
     text
@@ -79,78 +39,86 @@ class Outcome:
         What writing back would change, or has changed.
     """
 
+    kind: Literal["promoted", "written"]
     state: Literal["running", "diff", "done", "refused"]
     text: str
     to: str = ""
     diff: str = ""
 
 
-class ReportingJob(Job):
-    """A job that reports its outcomes.
+class BundleJob:
+    """Promotes a runner or writes the values of a service back: one at a time, on a thread of its own.
 
     Parameters
     ----------
-    name
-        Of the thread.
     report
-        Is called with each ``Outcome``, on the job's thread. What it raises is logged.
+        Is called with each ``Outcome``, on that thread: what is running, then what came of it. What it raises is
+        logged.
     """
 
-    def __init__(self, name: str, report: Callable[[Outcome], None]) -> None:
-        super().__init__(name)
+    def __init__(self, report: Callable[[Outcome], object]) -> None:
         self._report = report
+        self._lock = threading.Lock()
         self._last: Outcome | None = None
+        self._worker = Worker("epypes-bundle")
 
-    def start(self, running: Outcome, work: Callable[[], Outcome]) -> bool:
-        """Report what is running, then do it, and report what came of it; return at once, False if some is running."""
+    def promote(self, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None = None) -> bool:
+        """Begin to promote a runner and return at once; False, and nothing else, if something is running.
 
-        def report_both() -> None:
-            self._tell(running)
-            try:
-                outcome = work()
-            except BaseException as error:  # a function of the user's may raise anything, SystemExit too
-                outcome = Outcome("refused", _text_of(error), running.to)
-            self._tell(outcome)
+        The runner's own runs are left alone: its graph is run anew, with its hyperparameters and its last payload,
+        since its last run may be a partial one and the next one may begin meanwhile.
 
-        return self.run(report_both)
+        Parameters
+        ----------
+        runner
+            Has been run.
+        to
+            The folder of the bundle, as for ``ep.promote``; ``~`` is the home folder.
+        outputs
+            The tokens that the service answers with; the sink tokens without.
+        """
+        running = Outcome("promoted", "running", f"Promoting to {to} ...", to)
+        return self._start(running, lambda: _promoted(runner, to, outputs))
+
+    def write_back(self, write: Callable[[bool], Any], *, dry_run: bool) -> bool:
+        """Begin to write the values of a service into its bundle and return at once; False if something is running.
+
+        Parameters
+        ----------
+        write
+            Is called with ``dry_run``; its answer has ``diff`` and ``digest``.
+        dry_run
+            Whether to show what would change; nothing is written then.
+        """
+        text = "Looking at what would change ..." if dry_run else "Writing, and replaying the samples ..."
+        return self._start(Outcome("written", "running", text), lambda: _written(write(dry_run), dry_run))
 
     def wait(self, timeout_s: float) -> Outcome | None:
-        """Return what was reported last once nothing is running; TimeoutError if that takes longer."""
-        self.wait_end(timeout_s)
+        """Return what came of the last one; None if there was none. TimeoutError if it takes longer."""
+        self._worker.wait(timeout_s)
         return self._last
 
-    def _tell(self, outcome: Outcome) -> None:
-        self._last = outcome
+    def _start(self, running: Outcome, work: Callable[[], Outcome]) -> bool:
+        with self._lock:
+            if self._last is not None and self._last.state == "running":
+                return False
+            self._last = running
+        self._worker.post("running", lambda: self._report(running))
+        self._worker.post("outcome", lambda: self._do(running, work))
+        return True
+
+    def _do(self, running: Outcome, work: Callable[[], Outcome]) -> None:
         try:
-            self._report(outcome)
-        except Exception:
-            _LOG.exception("The outcome of %s could not be shown", self._name)
+            self._last = work()
+        except BaseException as error:  # a function of the user's may raise anything, SystemExit too
+            self._last = Outcome(running.kind, "refused", _text_of(error), running.to)
+        self._report(self._last)
 
 
 def _text_of(error: BaseException) -> str:
     notes = "".join(f"\n{note}" for note in getattr(error, "__notes__", ()))
     text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error}"
     return text if isinstance(error, PromotionRefused) else f"Not done: {text}{notes}"
-
-
-def start_promotion(job: ReportingJob, runner: CompGraphRunner, to: str, outputs: Sequence[str] | None = None) -> bool:
-    """Begin to promote a runner and return at once; False, and nothing else, if a promotion is running.
-
-    The runner's own runs are left alone: its graph is run anew, with its hyperparameters and its last payload, since
-    its last run may be a partial one and the next one may begin meanwhile.
-
-    Parameters
-    ----------
-    job
-        Reports the outcome.
-    runner
-        Has been run.
-    to
-        The folder of the bundle, as for ``ep.promote``; ``~`` is the home folder.
-    outputs
-        The tokens that the service answers with; the sink tokens without.
-    """
-    return job.start(Outcome("running", f"Promoting to {to} ...", to), lambda: _promoted(runner, to, outputs))
 
 
 def proposal(token: str | None) -> str:
@@ -167,7 +135,7 @@ def proposal(token: str | None) -> str:
 
 def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -> Outcome:
     if not to.strip():
-        return Outcome("refused", "Not promoted: name a folder, such as services/edges.", to)
+        return Outcome("promoted", "refused", "Not promoted: name a folder, such as services/edges.", to)
     own, last = runner, runner.last
     if last is not None:
         own = CompGraphRunner(
@@ -180,30 +148,15 @@ def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -
     names = f"output{'s' * (len(bundle.settings.outputs) != 1)} {listed(bundle.settings.outputs)}"
     text = f"Promoted to {to.strip()}: {names}; {samples} replayed in a fresh process, identical."
     assumptions = bundle.settings.assumptions()
-    return Outcome("done", f"{text}\n{assumptions}" if assumptions else text, to)
-
-
-def start_write_back(job: ReportingJob, write: Callable[[bool], Any], *, dry_run: bool) -> bool:
-    """Begin to write the values of a service back into its bundle and return at once; False if that is running.
-
-    Parameters
-    ----------
-    job
-        Reports the outcome.
-    write
-        Is called with ``dry_run``; its answer has ``diff`` and ``digest``.
-    dry_run
-        Whether to show what would change; nothing is written then.
-    """
-    text = "Looking at what would change ..." if dry_run else "Writing, and replaying the samples ..."
-    return job.start(Outcome("running", text), lambda: _written(write(dry_run), dry_run))
+    return Outcome("promoted", "done", f"{text}\n{assumptions}" if assumptions else text, to)
 
 
 def _written(answer: Any, dry_run: bool) -> Outcome:
     diff, digest = str(answer.diff), str(answer.digest)[:_DIGEST_CHARACTERS]
     if not diff:
-        return Outcome("done", f"pipeline.toml has these values already; the bundle is {digest}.")
+        return Outcome("written", "done", f"pipeline.toml has these values already; the bundle is {digest}.")
     diff = diff if len(diff) <= _DIFF_CHARACTERS else f"{diff[:_DIFF_CHARACTERS]}\n..."
     if dry_run:
-        return Outcome("diff", "This would change in pipeline.toml.", diff=diff)
-    return Outcome("done", f"Written to pipeline.toml and replayed; the bundle is {digest} now.", diff=diff)
+        return Outcome("written", "diff", "This would change in pipeline.toml.", diff=diff)
+    text = f"Written to pipeline.toml and replayed; the bundle is {digest} now."
+    return Outcome("written", "done", text, diff=diff)

@@ -1,23 +1,26 @@
 """The values that each hyperparameter of a runner may take, and which two of them are the ends of one range.
 
-The hint that the user gave comes first, then the annotation of a function that takes the token, then the catalog of
-OpenCV's and scikit-image's parameters, then the value. No widgets here.
+The hint that the user gave comes first, then the branches of a switch, the annotation of a function that takes the
+token, the catalog of OpenCV's and scikit-image's parameters, and the value. No widgets here.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from epypes.catalog import entry_of, fits, parameter_names, uses, usual
-from epypes.catalog.ranges import without_negative
+from epypes.catalog import entry_of, fits, parameter_names, range_of, uses, usual
 from epypes.errors import UnknownName
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
-from epypes_widgets.target import Tunable
 from epypes_widgets.values import as_python, is_integer, is_movable
+
+if TYPE_CHECKING:
+    from epypes_widgets.session import Tunable
 
 Range = Param | Roi | Text | None
 
@@ -40,8 +43,8 @@ def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
     Returns
     -------
     dict
-        By token. A Param has choices, or two hard ends, or ``soft``. Of two tokens that bound a range, the lower one
-        names the other by ``below``.
+        By token. A Param has choices, or two finite ends: hard ones, or ``soft``. Of two tokens that bound a range, the
+        lower one names the other by ``below``.
 
     Raises
     ------
@@ -98,18 +101,20 @@ def _closed(param: Range, value: Any) -> Range:
         return param
     if not is_movable(value):
         return None
-    if param.soft is not None:
-        low, high = param.soft
-        return replace(param, soft=(min(low, as_python(value)), max(high, as_python(value))))
-    if param.low is not None and param.high is not None:
-        return param
-    around = param_from_value(as_python(value))
+    number = as_python(value)
+    low, high = (min(param.soft[0], number), max(param.soft[1], number)) if param.soft else (number, number)
+    if low < high and math.isfinite(low) and math.isfinite(high):
+        return replace(param, soft=(low, high))
+    low, high = (None if end is None or math.isinf(end) else end for end in (param.low, param.high))
+    if low is not None and high is not None:
+        return replace(param, soft=None)
+    around = param_from_value(number)
     if around is None or around.low is None or around.high is None:
         return None
-    low = around.low if param.low is None else param.low
-    if param.low is None and param.high is not None:
-        low = min(low, param.high)
-    high = param.high if param.high is not None else max(around.high, 10 * low if param.log else low + 1)
+    if low is None:
+        low = around.low if high is None else min(around.low, high)
+    if high is None:
+        high = max(around.high, 10 * low if param.log else low + 1)
     return replace(param, soft=(low, high))
 
 
@@ -129,9 +134,9 @@ def _read(runner: Tunable, name: str, hint: Any) -> Param | Roi:
             f"{name!r} is {value!r:.60}, outside of its hint ({range_text(param)}). "
             f"Set runner[{name!r}] to a value inside, or widen the hint."
         )
-    for token in (param.on,) if isinstance(param, Roi) else (param.cuts,):
-        if token:
-            runner.cg.require_token(token)
+    image = param.on if isinstance(param, Roi) else param.cuts
+    if image:
+        runner.cg.require_token(image)
     if isinstance(param, Param) and param.below and param.below not in runner.hyperparameters:
         raise UnknownName("hyperparameter", param.below, runner.hyperparameters, "of this runner")
     return param
@@ -159,126 +164,87 @@ class Taker:
     tokens: dict[str, str]
 
 
-def takers(cg: CompGraph, token: str) -> Iterator[Taker]:
-    """Yield the functions that take a token, in run order."""
+def takers(cg: CompGraph, token: str) -> list[Taker]:
+    """Return the functions that take a token, in run order."""
+    found = []
     for name in cg.digraph.consumers.get(token, ()):
-        inputs = cg.func_inputs(name)
-        parameters = parameter_names(cg.functions[name])
-        position = inputs.index(token)
-        parameter = parameters[position] if position < len(parameters) else ""
-        yield Taker(name, cg.functions[name], parameter, dict(zip(parameters, inputs, strict=False)))
+        tokens = dict(zip(parameter_names(cg.functions[name]), cg.func_inputs(name), strict=False))
+        parameter = next((parameter for parameter, taken in tokens.items() if taken == token), "")
+        found.append(Taker(name, cg.functions[name], parameter, tokens))
+    return found
 
 
 # -- without a hint -------------------------------------------------------------------------------------------------
 
 
 def _guess(runner: Tunable, token: str) -> Range:
-    """Return the range that annotations, the catalog or the value give; what the value does not fit is passed over."""
-    value = runner.hyperparameters[token]
-    for source in (_annotated, _selected, _cataloged, _valued):
-        try:
-            found = source(runner, token, value)
+    """Return the range that the graph, the catalog or the value give; what the value does not fit is passed over."""
+    value, known = runner.hyperparameters[token], takers(runner.cg, token)
+    for source in (_branches, _annotated, _cataloged, _valued):
+        with suppress(Exception):  # values are any objects; one that can't be compared has no range
+            found = source(runner, token, value, known)
             if found is not None and allows(found, value):
                 return found
-        except Exception:  # noqa: S112 - values are any objects; one that can't be compared has no range
-            continue
     return None
 
 
-def _annotated(runner: Tunable, token: str, value: Any) -> Param | Roi | None:
+def _branches(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Param | None:
+    """Return the branches that a hyperparameter chooses among, in each of its switches."""
+    inputs = runner.cg.func_inputs
+    switches = [as_switch(taker.function) for taker in known if inputs(taker.name)[0] == token]
+    branches = [switch.branches for switch in switches if switch is not None]
+    return Param(choices=tuple(k for k in branches[0] if all(k in each for each in branches))) if branches else None
+
+
+def _annotated(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Param | Roi | None:
     """Return a fitting annotation in which parameters of the function are named by the tokens they get."""
-    cg = runner.cg
-    found = next((param for param in annotated_params(cg, token) if allows(param, value)), None)
-    if found is None:
-        return None
-    tokens = {name: taken for taker in reversed([*takers(cg, token)]) for name, taken in taker.tokens.items()}
+    found = next((param for param in annotated_params(runner.cg, token) if allows(param, value)), None)
+    tokens = {name: taken for taker in reversed(known) for name, taken in taker.tokens.items()}
 
     def named(name: str) -> str:
-        return name if name in cg.tokens else tokens.get(name, "")
+        return name if name in runner.cg.tokens else tokens.get(name, "")
 
     if isinstance(found, Roi):
         return replace(found, on=named(found.on))
-    if not found.below and not found.cuts:
+    if found is None or not (found.below or found.cuts):
         return found
     below = named(found.below)
     return replace(found, below=below if below in runner.hyperparameters else "", cuts=named(found.cuts))
 
 
-def _selected(runner: Tunable, token: str, value: Any) -> Param | None:
-    """Return the branches that a hyperparameter chooses among."""
-    for taker in takers(runner.cg, token):
-        switch = as_switch(taker.function)
-        if switch is not None and runner.cg.func_inputs(taker.name)[0] == token:
-            return Param(choices=switch.branches)
-    return None
-
-
-def _cataloged(runner: Tunable, token: str, value: Any) -> Param | None:
-    if not is_movable(value) and not isinstance(value, str | bool):
-        return None
-    found = _by_function(runner, token, value) or _by_name(runner, token, value)
-    if found is None or found.choices is not None:
-        return found
-    return without_negative(found, as_python(value))
-
-
-def _by_function(runner: Tunable, token: str, value: Any) -> Param | None:
-    for taker in takers(runner.cg, token):
-        entry = entry_of(taker.function, taker.parameter)
-        image = "" if entry is None else entry.cuts
-        used = [(use.entry, use.cuts) for use in uses(taker.function, taker.parameter) if use.entry]
-        for known, parameter in [(entry, image), *used]:
-            param = None if known is None else known.resolved()
-            if param is None or not _fits(param, value):
-                continue
-            if param.choices is not None:
-                return param
-            return replace(param, cuts=_payload(runner, taker.tokens.get(parameter, "")))
-    return None
-
-
-def _by_name(runner: Tunable, token: str, value: Any) -> Param | None:
-    known = list(takers(runner.cg, token))
+def _cataloged(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Param | None:
+    found = range_of(runner.cg, token, value)
     cuts = next(filter(None, (_cut_by(runner, taker, token) for taker in known)), "")
-    # What is compared with an image is a threshold, whatever it is called.
-    asked = dict.fromkeys([*(taker.parameter for taker in known), token, *(["threshold"] if cuts else [])])
-    found = next(filter(None, (usual(name, as_python(value)) for name in asked if name)), None)
-    if found is None or not _fits(found, value):
+    if found is None and cuts:  # what is compared with an image is a threshold, whatever it is called
+        found = usual("threshold", as_python(value))
+    if not isinstance(found, Param) or not fits(found, value) or (found.choices is None and not is_movable(value)):
         return None
     return replace(found, cuts=cuts) if cuts and found.choices is None else found
 
 
 def _cut_by(runner: Tunable, taker: Taker, token: str) -> str:
-    """Return the token that a function compares with this one; empty if that is not known."""
-    found = uses(taker.function, taker.parameter)
-    compared = (_payload(runner, taker.tokens.get(use.cuts, "")) for use in found if use.entry is None)
-    image = next(filter(None, compared), "")
+    """Return the token whose values a function compares with this one; empty if that is not known."""
+    entry, used = entry_of(taker.function, taker.parameter), uses(taker.function, taker.parameter)
+    compared = [*([entry.cuts] if entry else []), *(use.cuts for use in used)]
+    payload = [name for name in runner.cg.func_inputs(taker.name) if name not in runner.hyperparameters]
+    image = next((taker.tokens[name] for name in compared if taker.tokens.get(name) in payload), "")
     if image:
         return image
-    inputs = [name for name in runner.cg.func_inputs(taker.name) if _payload(runner, name)]
     is_threshold = bool(_THRESHOLDS & {*_words(taker.parameter), *_words(token)})
-    known = any(use.entry is not None for use in found)  # a function whose thresholds are not of values, as Canny
-    return inputs[0] if is_threshold and len(inputs) == 1 and not known else ""
+    is_known = entry or any(use.entry for use in used)  # by the catalog: not of values, as the thresholds of Canny
+    return payload[0] if is_threshold and len(payload) == 1 and not is_known else ""
 
 
-def _payload(runner: Tunable, token: str) -> str:
-    return "" if token in runner.hyperparameters else token
-
-
-def _valued(runner: Tunable, token: str, value: Any) -> Range:
+def _valued(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Range:
     if isinstance(value, str):
         return Text()
     if isinstance(value, tuple | list):
-        names = (token, *(taker.parameter for taker in takers(runner.cg, token)))
+        names = (token, *(taker.parameter for taker in known))
         return Roi() if any(_RECTANGLES.intersection(_words(name)) for name in names) else None
     param = param_from_value(as_python(value))
     if param is None or param.choices is not None or param.low is None or param.high is None:
         return param
     return Param(step=param.step, soft=(param.low, param.high))
-
-
-def _fits(param: Param, value: Any) -> bool:
-    return (param.choices is not None or is_movable(value)) and fits(param, value)
 
 
 def _words(name: str) -> tuple[str, ...]:
@@ -296,47 +262,39 @@ def _paired(runner: Tunable, found: Mapping[str, Range], given: Mapping[str, Ran
     neither has a hint, their names or those of their parameters differ by low and high, and their values are of one
     type and in order.
     """
-    ranges, values = dict(found), runner.hyperparameters
+    values = runner.hyperparameters
+    ranges = {token: replace(param, below="") if isinstance(param, Param) else param for token, param in found.items()}
+    declared = [(token, param.below) for token, param in found.items() if isinstance(param, Param) and param.below]
     taken: set[str] = set()
-
-    def take(low: str, high: str) -> bool:
-        fits = low != high and not {low, high} & taken and _is_pair(values, low, high, ranges)
-        taken.update((low, high) if fits else ())
-        return fits
-
-    for token, param in found.items():
-        if not isinstance(param, Param) or not param.below or take(token, param.below):
-            continue
-        if token in given:
-            raise ValueError(
-                f"{token!r} ({values[token]!r:.60}) is hinted to stay below {param.below!r} "
-                f"({values[param.below]!r:.60}). Both must be numbers of one type, in order, and in no other pair. "
-                "Set them so, or leave below out."
-            )
-        ranges[token] = replace(param, below="")
-    for low, high in _named_pairs(runner, [token for token in ranges if token not in given]):
+    for low, high in (*declared, *_named_pairs(runner, [token for token in ranges if token not in given])):
         param = ranges[low]
-        if isinstance(param, Param) and take(low, high):
+        is_free = low != high and not {low, high} & taken
+        if isinstance(param, Param) and is_free and _is_pair(values, low, high, ranges):
+            taken |= {low, high}
             ranges[low] = replace(param, below=high)
+        elif low in given:
+            raise ValueError(
+                f"{low!r} ({values[low]!r:.60}) is hinted to stay below {high!r} ({values[high]!r:.60}). Both must be "
+                "numbers of one type, in order, and in no other pair. Set them so, or leave below out."
+            )
     return ranges
 
 
 def _is_pair(values: Mapping[str, Any], low: str, high: str, ranges: Mapping[str, Range]) -> bool:
-    params = (ranges.get(low), ranges.get(high))
-    if not all(isinstance(param, Param) and param.choices is None for param in params):
+    if any(not isinstance(param := ranges.get(name), Param) or param.choices is not None for name in (low, high)):
         return False
     one, other = values[low], values[high]
-    is_moved = is_movable(one) and is_movable(other)
-    return is_moved and is_integer(one) == is_integer(other) and bool(one <= other)
+    return is_movable(one) and is_movable(other) and is_integer(one) == is_integer(other) and bool(one <= other)
 
 
 def _named_pairs(runner: Tunable, tokens: list[str]) -> Iterator[tuple[str, str]]:
     """Yield the tokens whose names differ by low and high, and those whose parameters do."""
     for token in tokens:
         for taker in takers(runner.cg, token):
-            inputs = runner.cg.func_inputs(taker.name)
-            by_name = (other for other in inputs if _words(other) in _uppers(token))
-            by_parameter = (other for name, other in taker.tokens.items() if _words(name) in _uppers(taker.parameter))
+            uppers, inputs = _uppers(token), runner.cg.func_inputs(taker.name)
+            by_name = [other for other in inputs if _words(other) in uppers]
+            uppers = _uppers(taker.parameter)
+            by_parameter = [other for name, other in taker.tokens.items() if _words(name) in uppers]
             yield from ((token, other) for other in (*by_name, *by_parameter) if other in tokens)
 
 

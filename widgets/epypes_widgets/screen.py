@@ -7,17 +7,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import count
-from operator import is_
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
-from epypes_widgets.session import Session
-from epypes_widgets.stages import Stage, best_stage, stages, states
-from epypes_widgets.target import Tunable
-from epypes_widgets.values import json_values
+from epypes_widgets.session import Session, Tunable
+from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
+from epypes_widgets.values import is_same, json_values
 from epypes_widgets.view import PictureView
 
 _MAX_ENTRIES: Final = 40
@@ -81,12 +79,11 @@ class Shown:
         cut = self.cut if self.has_histogram else ()
         return tuple(dict.fromkeys(token for token in (self.token, self.other, *self.pinned, *cut) if token))
 
-    def within(self, stages: Sequence[Stage], run: Run) -> Shown:
+    def within(self, stages: Stages, run: Run) -> Shown:
         """Return what of this can be shown with these stages; another big picture if this one can't."""
-        known = {stage.token for stage in stages}
-        token = self.token if self.token in known else best_stage(run, stages)
-        pinned = tuple(name for name in self.pinned if name in known)
-        comparison = self.comparison if not self.other or self.other in known else None
+        token = self.token if self.token in stages else best_stage(run, stages)
+        pinned = tuple(name for name in self.pinned if name in stages)
+        comparison = self.comparison if not self.other or self.other in stages else None
         return replace(self, token=token, pinned=pinned, comparison=comparison)
 
 
@@ -137,23 +134,20 @@ class Screen:
         self.view = view
         before = _last_shown.get(session.runner, Shown())
         self.shown = Shown(asked or before.token, before.pinned, has_histogram=bool(cut), cut=cut)
-        self.stages: tuple[Stage, ...] = ()
+        self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
         self.listed = 0
         self._session, self._history, self._asked = session, history, asked
         self._lock = threading.Lock()
         self._seq = count(1).__next__
-        self._failure: dict[str, Any] = {}
-        self._note = {"text": "", "waits": False}
+        # The last message of each kind that a view which is mounted later must get again, with its bytes.
+        self._kept: dict[str, tuple[dict[str, Any], tuple[bytes, ...]]] = {}
         self._is_closed = False
-        self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
         # Held while the history is sent, so that what is sent last is the newest.
         self._listing = threading.Lock()
         self._pictured: set[int] = set()
-        self._log: list[dict[str, str]] = []
-        self.verdicts: dict[str, Any] | None = None
         self.change()
 
     # -- what is shown ------------------------------------------------------------------------------------------
@@ -163,11 +157,11 @@ class Screen:
         with self._lock:
             self.shown = _last_shown[self._session.runner] = replace(self.shown, **parts)
 
-    def require_stage(self, token: object) -> str:
+    def require_stage(self, token: str) -> str:
         """Return the token; LookupError if it is no stage."""
-        if not any(stage.token == token for stage in self.stages):
+        if token not in self.stages:
             raise LookupError(f"{token!r} has no picture here.")
-        return str(token)
+        return token
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
@@ -186,28 +180,25 @@ class Screen:
         if shown.token is None:  # a graph may have no tokens
             return
         if failed is None:
-            self._failure, self.error = {}, ""
+            self.error = ""
+            self._kept.pop("error", None)
             if self._note["waits"]:
                 self.note("")
             self.compute_ms = run.report.total_ns / 1e6
-        frame = make_frame(
-            run,
-            shown.token,
-            self._seq(),
-            shown,
-            changed_ns,
-            self._pictures,
-            stale=failed is not None,
-            **self._payload_shown,
-            stages=states(failed or run, self.stages),
-        )
+        image = self._session.image_wanted
+        content = {
+            "stale": failed is not None,
+            "image": image,
+            "time_s": None if image is None else self._session.payloads.time_s(image),
+            "stages": states(failed or run, self.stages),
+        }
+        frame = make_frame(run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
         self.view.frames.offer(frame)
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
         """Say what failed, and where; the picture stays. An empty text ends that."""
         self.error = text = text[:_ERROR_CHARACTERS]
-        self._failure = {"seq": self._seq(), "text": text, "function": function, "names": list(names)}
-        self.view.tell("error", self._failure)
+        self.tell("error", {"seq": self._seq(), "text": text, "function": function, "names": list(names)})
 
     def note(self, text: str, *, waits: bool = False) -> None:
         """Say something that is no failure; it stays until another text, or none.
@@ -216,46 +207,48 @@ class Screen:
         """
         if waits and self.error:
             self.fail("")
-        if self._note != {"text": text, "waits": waits}:
-            self._note = {"text": text, "waits": waits}
-            self.view.tell("note", self._note)
+        content = {"text": text, "waits": waits}
+        if content != self._note:
+            self.tell("note", content)
+
+    @property
+    def _note(self) -> dict[str, Any]:
+        return self._kept["note"][0] if "note" in self._kept else {"text": "", "waits": False}
 
     def refers_to(self, key: object, payload: Sequence[Any]) -> bool:
         """Whether the picture is compared with this, computed from the very values of this payload."""
-        before, values = self._referred
-        return before == key and len(values) == len(payload) and all(map(is_, values, payload))
+        return self._referred[0] == key and is_same(self._referred[1], tuple(payload))
 
     def refer(self, key: object, payload: Sequence[Any], label: str, run: Run, token: str) -> None:
         """Show a token of another run to compare with."""
         self._referred = key, tuple(payload)
         described, data = picture(run, token, "other", had_pictures=self._pictures)
-        self._reference = {"seq": self._seq(), "label": label, "picture": described}, (data,) if data else ()
-        self.view.tell("reference", *self._reference)
+        content = {"seq": self._seq(), "label": label, "picture": described}
+        self.tell("reference", content, (data,) if data else ())
 
     def refer_anew(self, *, to_nothing: bool = False) -> None:
         """Have what the picture is compared with computed again; or compare with nothing, or another stage."""
         self._referred = (None, ())
         if to_nothing:
-            self._reference = None
-
-    @property
-    def _payload_shown(self) -> dict[str, Any]:
-        """The index of the payload, and, of a frame of a video, its time in s."""
-        index, video = self._session.image_wanted, self._session.video
-        return {"image": index, "time_s": None if video is None or index is None else video.video.time_s(index)}
+            self._kept.pop("reference", None)
 
     @property
     def _pictures(self) -> set[str]:
-        return {stage.token for stage in self.stages if stage.is_picture}
+        return {token for token, is_picture in self.stages.items() if is_picture}
 
     # -- on any thread ------------------------------------------------------------------------------------------
+
+    def tell(self, kind: str, content: dict[str, Any], buffers: tuple[bytes, ...] = ()) -> None:
+        """Send a message, now and to each view that is mounted until the next one of its kind."""
+        self._kept[kind] = content, buffers
+        self.view.tell(kind, content, buffers)
 
     def send_setup(self) -> None:
         """Send all that a new view must know, but for the picture."""
         setup, buffers = self.setup()
         shown = self.shown
         setup |= {
-            "stages": [{"token": stage.token, "is_picture": stage.is_picture} for stage in self.stages],
+            "stages": [{"token": token, "is_picture": is_picture} for token, is_picture in self.stages.items()],
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
@@ -267,7 +260,7 @@ class Screen:
         """Send the last entries; a thumbnail goes to a view once, and is empty from then on."""
         with self._listing:
             entries, current = self._history.entries, self._history.current
-            numbers = self._session.frames
+            numbers = self._session.payloads.numbers
             pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
             pairs = pairs if len(pairs) <= _MAX_ENTRIES else [pairs[0], *pairs[1 - _MAX_ENTRIES :]]
@@ -289,22 +282,24 @@ class Screen:
             pictures = [b"" if each is None else each.data for each in new]
             self.view.tell("history", {"entries": content, **state}, pictures)
 
-    def send_verdicts(self, content: dict[str, Any]) -> None:
-        """Send which test images pass."""
-        self.verdicts = content
-        self.view.tell("cases", content)
-
-    def log(self, text: str) -> None:
-        """Add a line to the log drawer."""
-        line = {"at": f"{datetime.now().astimezone():%H:%M:%S}", "text": text[:_LINE_CHARACTERS]}
-        with self._lock:
-            self._log = [*self._log, line][-_MAX_LINES:]
-        self.view.tell("log", {"lines": self._log})
+    def log(self, *texts: str) -> None:
+        """Add lines to the log drawer."""
+        if not texts:
+            return
+        at = f"{datetime.now().astimezone():%H:%M:%S}"
+        with self._lock:  # of two threads none loses the other's line
+            lines = [*self._lines, *({"at": at, "text": text[:_LINE_CHARACTERS]} for text in texts)][-_MAX_LINES:]
+            self._kept["log"] = {"lines": lines}, ()
+        self._tell_again("log")
 
     @property
     def lines(self) -> tuple[str, ...]:
         """What is in the log drawer."""
-        return tuple(f"{line['at']} {line['text']}" for line in self._log)
+        return tuple(f"{line['at']} {line['text']}" for line in self._lines)
+
+    @property
+    def _lines(self) -> list[dict[str, str]]:
+        return self._kept["log"][0]["lines"] if "log" in self._kept else []
 
     def close(self, text: str) -> None:
         """Say that values are not followed any more."""
@@ -320,14 +315,11 @@ class Screen:
             self._pictured.clear()
         self.send_setup()
         self.send_history()
-        if self.verdicts is not None:
-            self.view.tell("cases", self.verdicts)
-        if self._reference is not None:
-            self.view.tell("reference", *self._reference)
-        if self._log:
-            self.view.tell("log", {"lines": self._log})
+        self._tell_again("cases", "reference", "log")
         self.view.frames.ready()
-        if self._note["text"]:
-            self.view.tell("note", self._note)
-        if self._failure:
-            self.view.tell("error", self._failure)
+        self._tell_again("note", "error")
+
+    def _tell_again(self, *kinds: str) -> None:
+        for kind in kinds:
+            if (kept := self._kept.get(kind)) is not None:
+                self.view.tell(kind, *kept)

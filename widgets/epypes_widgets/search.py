@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.errors import EpypesError, ScaleError, StillRunning
+from epypes.errors import EpypesError, ScaleError
 from epypes.hints import Param
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
-from epypes_widgets.promotion import Job
-from epypes_widgets.target import Tunable
+from epypes_widgets.session import Tunable
 from epypes_widgets.values import setting_text
+from epypes_widgets.worker import Worker
 
 if TYPE_CHECKING:
     from epypes.batch.optimize import Direction, OptimizeResult, Trial
@@ -29,7 +29,7 @@ MAX_TRIALS: Final = 10_000
 State = Literal["idle", "running", "stopping", "done", "refused"]
 
 
-class Search(Job):
+class Search:
     """Searches hyperparameters on a thread of its own, one search at a time.
 
     Parameters
@@ -39,7 +39,12 @@ class Search(Job):
     metric, direction, cases
         As for ``ep.optimize``; without cases, the payload of the last run is the one case.
     ranges
-        Returns what hyperparameters may be, by token; those vary that are choices, or numbers between two ends.
+        What hyperparameters may be, by token; those vary that are choices, or numbers between two ends.
+
+    Raises
+    ------
+    TypeError
+        It is a running service.
 
     Attributes
     ----------
@@ -51,22 +56,21 @@ class Search(Job):
 
     def __init__(
         self,
-        runner: CompGraphRunner,
+        runner: Tunable,
         metric: Any,
         direction: Direction,
         cases: Any,
-        ranges: Callable[[], Mapping[str, Any]],
+        ranges: Mapping[str, Any],
     ) -> None:
-        super().__init__("epypes-search")
+        if not isinstance(runner, CompGraphRunner):
+            text = "metric is for a runner: a running service has one image at a time. Optimise where it was made."
+            raise TypeError(text)
         self.result: OptimizeResult | None = None
         self.report: Callable[[], None] = lambda: None
-        self._runner, self._metric, self._direction, self._cases, self._ranges = (
-            runner,
-            metric,
-            direction,
-            cases,
-            ranges,
-        )
+        self._runner, self._metric, self._direction = runner, metric, direction
+        self._cases = cases
+        self._ranges = {name: param for name, param in ranges.items() if isinstance(param, Param)}
+        self._worker = Worker("epypes-search")
         # Held while reporting, so that nothing older comes after something newer.
         self._reporting = threading.RLock()
         self._stop = threading.Event()
@@ -75,6 +79,11 @@ class Search(Job):
         self._n, self._refusal, self._reports, self._reported_s = FIRST_N, "", 0, 0.0
         self._trials: list[Trial] = []
         self._importances: Mapping[str, float] = {}
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a search has begun and not ended."""
+        return self._state in ("running", "stopping")
 
     @property
     def best(self) -> Trial | None:
@@ -86,30 +95,30 @@ class Search(Job):
     def start(self, n: int = FIRST_N) -> bool:
         """Begin a search of so many trials and return at once; False, and nothing else, if one is running."""
         with self._reporting:
-            if self.is_running:
+            if self.is_running or self._worker.closed:
                 return False
             self._stop.clear()
             self._n, self._trials, self._importances = min(max(1, n), MAX_TRIALS), [], {}
             self._tell("running")
-            return self.run(self._search)
+            self._worker.post("search", self._search)
+            return True
 
     def stop(self) -> None:
         """Have the search end when the case that runs has ended; return at once."""
         with self._reporting:
-            if self.is_running and not self._stop.is_set():
+            if self._state == "running":
                 self._stop.set()
                 self._tell("stopping")
 
     def wait(self, timeout_s: float) -> OptimizeResult | None:
         """Return the result once nothing is running; TimeoutError if that takes longer."""
-        self.wait_end(timeout_s)
+        self._worker.wait(timeout_s)
         return self.result
 
     def close(self, timeout_s: float) -> None:
         """Stop, and wait for that; StillRunning if a function does not return in time."""
         self.stop()
-        if not self._ended.wait(timeout_s):
-            raise StillRunning(self._name, (), timeout_s)
+        self._worker.close(timeout_s)
 
     def content(self) -> dict[str, Any]:
         """Return what a view gets, ready for JSON."""
@@ -154,7 +163,7 @@ class Search(Job):
                 self._last_payload() if self._cases is None else self._cases,
                 self._n,
                 direction=self._direction,
-                ranges={name: param for name, param in self._ranges().items() if isinstance(param, Param)},
+                ranges=self._ranges,
                 stop=self._stop,
                 on_trial=self._tried,
                 progress=False,
@@ -168,7 +177,6 @@ class Search(Job):
             self._refusal = f"{type(error).__name__}: {error}"
         with self._reporting:
             self._tell(state)
-            self._ended.set()
 
     def _last_payload(self) -> list[Mapping[str, Any]]:
         last = self._runner.last
@@ -183,7 +191,7 @@ class Search(Job):
     def _tried(self, trial: Trial) -> None:
         with self._reporting:
             self._trials.append(trial)
-            if monotonic() - self._reported_s >= _REPORT_S and not self._stop.is_set():
+            if monotonic() - self._reported_s >= _REPORT_S and self._state == "running":
                 self._reported_s = monotonic()
                 self._tell("running")
 
@@ -193,16 +201,3 @@ class Search(Job):
             self.report()
         except Exception:
             _LOG.exception("How far a search has come could not be shown")
-
-
-def search_of(
-    runner: Tunable, metric: Any, direction: Direction, cases: Any, ranges: Callable[[], Mapping[str, Any]]
-) -> Search | None:
-    """Return the search of a runner's hyperparameters; None without a metric, TypeError for a running service."""
-    if metric is None:
-        return None
-    if not isinstance(runner, CompGraphRunner):
-        raise TypeError(
-            "metric is for a runner: a running service has one image at a time. Optimise where it was made."
-        )
-    return Search(runner, metric, direction, cases, ranges)

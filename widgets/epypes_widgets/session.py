@@ -2,6 +2,10 @@
 
 Values that are set wait here. They are tried on the runner, and taken over by it together with what was computed from
 them, in one step; so cells never see the one without the other. Values with which a function fails go on waiting.
+
+What is tuned is a runner of this process, or a running service. What is tried on a runner changes nothing, and only the
+user's own cells change it. What is tried on a service is done there, others may tune it at the same time, and its
+events come by themselves.
 """
 
 from __future__ import annotations
@@ -9,12 +13,34 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from operator import is_, is_not
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets.frame_states import FrameStates
-from epypes_widgets.images import Payload, VideoPayloads, is_alike
-from epypes_widgets.target import Tunable
+from epypes_widgets.images import Payloads, is_alike
+
+if TYPE_CHECKING:
+    from epypes.service.remote.runner import RemoteRunner
+
+Tunable: TypeAlias = "CompGraphRunner | RemoteRunner"
+
+
+def tunable(given: object) -> Tunable:
+    """Return what is tuned: what was given, or what it has for that, as a connection to a service does.
+
+    Raises
+    ------
+    TypeError
+        It can't be tuned.
+    """
+    found: Any = given.to_tune() if hasattr(given, "to_tune") else given
+    if not isinstance(found, CompGraphRunner) and not hasattr(found, "connection"):
+        raise TypeError(
+            f"tune() takes a CompGraphRunner or a connection to a service, not {type(given).__name__!r}: "
+            "tune(CompGraphRunner(cg, hparams)), tune(ep.connect(url))."
+        )
+    tuned: Tunable = found
+    return tuned
 
 
 class Session:
@@ -38,7 +64,7 @@ class Session:
         overwritten unseen, and values are written back.
     """
 
-    def __init__(self, runner: Tunable, payloads: Sequence[Payload] = ()) -> None:
+    def __init__(self, runner: Tunable, payloads: Payloads) -> None:
         self.runner, self.payloads = runner, payloads
         self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
@@ -50,18 +76,18 @@ class Session:
         # The runner's last run as of ``result``.
         self._followed: Run | None = None
         self._lock = threading.Lock()
+        self._is_closed = False
         self._wanted: dict[str, Any] = {}
         self._image_wanted: int | None = None
         self._seen = dict(runner.hyperparameters)
-        self._is_closed = False
-        if isinstance(runner, CompGraphRunner) and runner.state and self.payloads:
+        if isinstance(runner, CompGraphRunner) and runner.state and len(payloads):
             self.states = FrameStates(runner, self.payloads)
             # Cells may have run this frame with another state.
             self._image_wanted = self.image or 0
 
     def begin(self) -> None:
         """Have the first payload run if nothing has been; what a function raises on it is raised."""
-        if self.runner.last is not None or not self.payloads:
+        if self.runner.last is not None or not len(self.payloads):
             return
         run = self.runner.trial({}, payload=self.payloads[0].values)
         self.runner.adopt(run)
@@ -92,32 +118,6 @@ class Session:
         """The values of the free source tokens in the last run that completed."""
         run, free = self.result, self.runner.free_source_tokens
         return () if run is None else tuple(_value(run, token) for token in free)
-
-    @property
-    def title(self) -> str:
-        """What the payload of the last run is called; empty if it is not among those that may be chosen."""
-        if self.image is None:
-            return ""
-        video = self.video
-        return self.payloads[self.image].title if video is None else video.title(self.image)
-
-    @property
-    def video(self) -> VideoPayloads | None:
-        """The frames that may be chosen among; None if there is no video."""
-        return self.payloads if isinstance(self.payloads, VideoPayloads) else None
-
-    @property
-    def frames(self) -> range | None:
-        """The numbers of the frames that may be chosen among, of a video or a sequence; None of single images."""
-        video = self.video
-        if video is not None:
-            return video.video.numbers
-        return None if self.states is None else range(len(self.payloads))
-
-    @property
-    def frames_name(self) -> str:
-        """What the frames are of: the name of a video; empty for a sequence."""
-        return "" if self.video is None else self.video.video.path.name
 
     @property
     def notice(self) -> str:
@@ -198,27 +198,37 @@ class Session:
         """
         with self._lock:
             wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
-        payload = None if image is None else self.payloads[image].values
         last = self.runner.last
         is_own = last is self._followed
-        present = self.image if is_own else None  # what a cell has run begins as it did there
+        frame = self.image if image is None and is_own else image  # what a cell has run begins as it did there
         begun: tuple[int, object] | None = None
-        if self.states is not None and (frame := present if image is None else image) is not None:
-            values = {**self.runner.hyperparameters, **wanted}
-            begun = frame, self.states.key(values)
+        if self.states is not None and frame is not None:
+            begun = frame, self.states.key({**self.runner.hyperparameters, **wanted})
         if self.states is not None and begun is not None and not (begun == self._begun and is_own):
             # So that the runner has the state after the frame, too.
             needed = (*targets, *self.states.targets) if targets else ()
             run = self.states.trial(begun[0], wanted, *needed, is_superseded=is_superseded, report=report)
         else:
-            payload = payload if begun is None else None
+            payload = self.payloads[image].values if image is not None and begun is None else None
             run = self.runner.trial(wanted, *targets, payload=payload)
         if run.failure is not None or self._is_closed:
             return run, True
         is_new = bool(wanted) or image is not None or bool(run.report.ran)
         if is_new and not self.runner.adopt(run):
             return run, False
-        self._settle(run, wanted, image)
+        before = self.payload
+        with self._lock:
+            self.result = run
+            for name, value in wanted.items():
+                if self._wanted.get(name, self) is value:
+                    del self._wanted[name]
+                self._seen[name] = run.hyperparameters[name]
+            if image is not None:
+                self.image = image
+            elif len(before) != len(self.payload) or any(map(is_not, before, self.payload)):
+                self.image = self._image_of(run)
+            if self._image_wanted == image:
+                self._image_wanted = None
         self._begun, self._followed = begun, run if is_new else last
         return run, True
 
@@ -246,30 +256,9 @@ class Session:
 
     def _image_of(self, run: Run | None, is_one: Callable[[Any, Any], bool] = is_) -> int | None:
         """Return the index of the payload that a run was computed from."""
-        if run is None:
+        if run is None or not len(self.payloads):
             return None
-        if isinstance(self.payloads, VideoPayloads):
-            # By the arrays that were read: to compare pixels, all frames would have to be decoded.
-            found = (self.payloads.index_of(_value(run, token)) for token in self.runner.free_source_tokens)
-            return next(found, None)
-        for index, payload in enumerate(self.payloads):
-            if all(is_one(_value(run, token), value) for token, value in payload.values.items()):
-                return index
-        return None
-
-    def _settle(self, run: Run, wanted: Mapping[str, Any], image: int | None) -> None:
-        before = self.payload
-        with self._lock:
-            self.result = run
-            is_another = len(before) != len(self.payload) or any(map(is_not, before, self.payload))
-            for name, value in wanted.items():
-                if self._wanted.get(name, self) is value:
-                    del self._wanted[name]
-                self._seen[name] = run.hyperparameters[name]
-            if is_another:
-                self.image = self._image_of(run)
-            if self._image_wanted == image:
-                self._image_wanted = None
+        return self.payloads.index_of({token: _value(run, token) for token in self.runner.free_source_tokens}, is_one)
 
 
 def _value(run: Run, token: str) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import enum
 import os
 import secrets
@@ -15,7 +14,6 @@ from typing import Any, Final
 from epypes.bundle.settings import decode_value, encode_value, fits
 from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
-from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param
 from epypes.optional import optional_import
 from epypes_widgets.ranges import range_text
@@ -32,9 +30,7 @@ _MAX_REASONS: Final = 20
 _MEMBER: Final = "enum"
 
 
-def save(
-    path: str | Path, values: Mapping[str, Any], cg: CompGraph, params: Mapping[str, object] | None = None
-) -> Path:
+def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, object] | None = None) -> Path:
     """Write values as TOML, in one step: a file that was there is whole at every moment.
 
     Parameters
@@ -43,10 +39,8 @@ def save(
         The file; ``.toml`` is added if it is missing.
     values
         By hyperparameter.
-    cg
-        Its annotations give the ranges and units that stand beside the values.
     params
-        Hints that take their place, by hyperparameter.
+        By hyperparameter, the ranges and units that stand beside the values.
 
     Returns
     -------
@@ -62,8 +56,7 @@ def save(
     reasons = [reason for token, value in values.items() for reason in _unwritable(token, value)]
     if reasons:
         raise SettingsError(file, reasons)
-    hints = {token: next(annotated_params(cg, token), None) for token in values if token in cg.tokens}
-    text = _document(values, {**hints, **(params or {})})
+    text = _document(values, params or {})
     try:
         if file.is_file() and not _is_ours(file):
             raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
@@ -200,7 +193,8 @@ def _entries(file: Path) -> dict[str, Any]:
             raise SettingsError(file, [f"{file} is no plain file of at most {_MAX_BYTES / 1e6:g} MB."])
         document = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
-        raise SettingsError(file, [_missing(file)]) from error
+        unknown = UnknownName("settings", file.name.removesuffix(_SUFFIX), names(file.parent), f"in {file.parent}")
+        raise SettingsError(file, [str(unknown)]) from error
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(file, [f"{file} is not TOML: {error}."]) from error
     except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text, and a zero byte in the name
@@ -211,16 +205,6 @@ def _entries(file: Path) -> dict[str, Any]:
         text = f"{file} has no settings of a panel: its format is {found_format!r:.40}, not {FORMAT!r}"
         raise SettingsError(file, [f"{text} with [{_SECTION}]."])
     return entries
-
-
-def _missing(file: Path) -> str:
-    known = names(file.parent)
-    near = difflib.get_close_matches(file.name.removesuffix(_SUFFIX), known, n=1, cutoff=0.6)
-    if near:
-        hint = f"Did you mean {near[0]!r}?"
-    else:
-        hint = f"There are: {', '.join(known[:12])}." if known else "There are no settings in that folder."
-    return f"There is no file {file}. {hint}"
 
 
 def _value(entry: Any, token: str, present: Any) -> Any:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from epypes.display import Scene, is_image, scene_of
 from epypes.display.previews.arrays import is_strip, plain_array
@@ -26,23 +26,13 @@ _CHANNELS: Final = {"bgr": "BGRA", "rgb": "RGBA"}
 State = Literal["fresh", "stale", "failed", "absent", "nothing"]
 
 
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """A token that can be looked at.
-
-    Attributes
-    ----------
-    token
-        Its name.
-    is_picture
-        Whether it is an image, or can be drawn over one; any other is shown as text.
-    """
-
-    token: str
-    is_picture: bool
+# The tokens that can be looked at, in graph order, and whether each is an image or can be drawn over one; any other is
+# shown as text.
+Stages: TypeAlias = Mapping[str, bool]
+NO_STAGES: Final[Stages] = MappingProxyType({})
 
 
-def stages(run: Run, kept: Iterable[Stage] = (), asked: str | None = None) -> tuple[Stage, ...]:
+def stages(run: Run, kept: Stages = NO_STAGES, asked: str | None = None) -> dict[str, bool]:
     """Return the tokens that have a picture, and the sink tokens whatever they are, in graph order.
 
     Parameters
@@ -57,44 +47,41 @@ def stages(run: Run, kept: Iterable[Stage] = (), asked: str | None = None) -> tu
 
     Returns
     -------
-    tuple of Stage
-        Of a run that has neither pictures nor sink tokens, all tokens that have a value.
+    dict of bool
+        Whether it has a picture, by token. Of a run that has neither pictures nor sink tokens, all tokens that have a
+        value.
     """
-    known = {stage.token: stage.is_picture for stage in kept}
     sinks = run.cg.sink_tokens
     found: dict[str, bool] = {}
     for token in run.cg.tokens:
-        is_picture = known.get(token, False) or _has_picture(run, token)
-        if is_picture or token == asked or token in known or token in sinks:
+        is_picture = kept.get(token, False) or _has_picture(run, token)
+        if is_picture or token == asked or token in kept or token in sinks:
             found[token] = is_picture
-    found = found or dict.fromkeys(run, False)
-    return tuple(Stage(token, is_picture) for token, is_picture in found.items())
+    return found or dict.fromkeys(run, False)
 
 
-def best_stage(run: Run, stages: Iterable[Stage]) -> str | None:
+def best_stage(run: Run, stages: Stages) -> str | None:
     """Return the token to show first: the last that has a picture, of sink tokens if one has; None of none.
 
     An image of a few columns, such as descriptors are, comes after all other pictures.
     """
-    sinks, offered = run.cg.sink_tokens, tuple(stages)
+    sinks = run.cg.sink_tokens
 
-    def rank(place: int) -> tuple[int, bool, int]:
-        stage = offered[place]
-        value = _value(run, stage.token)
+    def rank(token: str) -> tuple[int, bool]:
+        value = _value(run, token)
         is_wide = not (is_image(value) and is_strip(value))
-        return stage.is_picture * (1 + is_wide), stage.token in sinks, place
+        return stages[token] * (1 + is_wide), token in sinks
 
-    best = max(range(len(offered)), key=rank, default=None)
-    return None if best is None else offered[best].token
+    return max(reversed([*stages]), key=rank, default=None)  # of equals the last
 
 
-def states(run: Run, stages: Iterable[Stage]) -> dict[str, State]:
+def states(run: Run, stages: Stages) -> dict[str, State]:
     """Return the state of every stage.
 
     ``"failed"`` is what the function that failed would have made, ``"absent"`` what was not computed,
     ``"nothing"`` that for which nothing was found.
     """
-    return {stage.token: _state(run, stage.token) for stage in stages}
+    return {token: _state(run, token) for token in stages}
 
 
 def _state(run: Run, token: str) -> State:
@@ -128,7 +115,7 @@ def _value(run: Run, token: str) -> Any:
 # -- at a pixel -------------------------------------------------------------------------------------------------------
 
 
-def probe(run: Run, stages: Iterable[Stage], x: float, y: float, shown: Scene) -> list[dict[str, str]]:
+def probe(run: Run, stages: Stages, x: float, y: float, shown: Scene) -> list[dict[str, str]]:
     """Return the values of all stages that are images at a pixel, ready for JSON; nothing is computed.
 
     Parameters
@@ -155,7 +142,7 @@ def probe(run: Run, stages: Iterable[Stage], x: float, y: float, shown: Scene) -
         return []
     rows = []
     with silent_numpy():
-        for token in (stage.token for stage in stages if stage.is_picture):
+        for token in (token for token, is_picture in stages.items() if is_picture):
             value = _value(run, token)
             if is_image(value):
                 image = one_channel(plain_array(value))

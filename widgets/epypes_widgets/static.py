@@ -11,7 +11,7 @@ import base64
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from epypes.display.previews.model import Look
+from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.text import content, cut, escape, fitted, written_length
 from epypes.errors import NotComputed
@@ -31,6 +31,28 @@ _TEXT_ROOM: Final = 800
 # Within the picture, since an output cuts off what is around it.
 _FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outline-offset:-1px"
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
+
+
+class Displayed:
+    """What shows its widget in a notebook, and a static output beside it."""
+
+    _static: StaticOutput
+
+    @property
+    def widget(self) -> Any:
+        """The widget that is shown, to be put into a layout of one's own."""
+        raise NotImplementedError
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        shown = self.widget._repr_mimebundle_()
+        bundle: dict[str, Any] = (shown[0] if isinstance(shown, tuple) else shown) or {}
+        return {**bundle, "text/plain": repr(self)}
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
+
+        display(self._repr_mimebundle_(), raw=True)
+        self._static.display()
 
 
 class StaticOutput:

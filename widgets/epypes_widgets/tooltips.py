@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from epypes.graph import CompGraph, unwrapped
 from epypes.hints import Param
-from epypes_widgets.ranges import Range, Taker, range_text, takers
+from epypes_widgets.ranges import Range, range_text, takers
 
 _MAX_CHARACTERS: Final = 300
 # Of a docstring: that of a class may be as long as a book.
@@ -24,18 +24,23 @@ def tooltip(cg: CompGraph, token: str, param: Range) -> str:
     It is the text on the parameter in the docstring of a function that takes it, else the hint's, else the first
     line of the docstring; then the unit and the range.
     """
-    about, facts = next(_abouts(cg, token, param), ""), _facts(param)
+    about, facts = next(filter(None, _abouts(cg, token, param)), ""), _facts(param)
     text = _cut(about, _MAX_CHARACTERS - len(facts) - 1) if facts else about
     return _cut(" ".join(part for part in (text, facts) if part), _MAX_CHARACTERS)
 
 
 def _abouts(cg: CompGraph, token: str, param: Range) -> Iterator[str]:
-    documented = [(taker, _docstring(taker.function)) for taker in takers(cg, token)]
-    yield from filter(None, (_parameter_text(text, taker) for taker, text in documented))
-    about = _one_line(getattr(param, "about", ""))
-    if about:
-        yield _sentence(about)
-    yield from filter(None, (_first_line(text) for _, text in documented))
+    """Yield what there is: the parameter's text of each function, the hint's, the first line of each docstring."""
+    known = [(taker.parameter, _docstring(taker.function)) for taker in takers(cg, token)]
+    for parameter, docstring in known:
+        section = _PARAMETERS.search(docstring)
+        if parameter:
+            yield _sentence(_numpydoc(section[1], parameter) if section else _doxygen(docstring, parameter))
+    yield _sentence(_one_line(getattr(param, "about", "")))
+    for _, docstring in known:
+        first = docstring.strip().partition("\n")[0]
+        if not _SIGNATURE.match(first):
+            yield _one_line(first)
 
 
 def _docstring(function: Any) -> str:
@@ -43,14 +48,6 @@ def _docstring(function: Any) -> str:
         return (inspect.getdoc(unwrapped(function)) or "")[:_MAX_READ]
     except Exception:  # a docstring may be any object
         return ""
-
-
-def _parameter_text(docstring: str, taker: Taker) -> str:
-    if not taker.parameter:
-        return ""
-    section = _PARAMETERS.search(docstring)
-    found = _numpydoc(section[1], taker.parameter) if section else _doxygen(docstring, taker.parameter)
-    return _sentence(found) if found else ""
 
 
 def _numpydoc(section: str, parameter: str) -> str:
@@ -73,11 +70,6 @@ def _doxygen(docstring: str, parameter: str) -> str:
     bare = re.sub(r"^\.?[ \t]*", "", docstring, flags=re.MULTILINE)
     found = re.search(rf"^@param {re.escape(parameter)} (.*?)(?=^@|\n\n|\Z)", bare, re.MULTILINE | re.DOTALL)
     return _one_line(re.sub(r"\\f\$|\\texttt|\\ref |#(?=\w)|[{}]", "", found[1])) if found else ""
-
-
-def _first_line(docstring: str) -> str:
-    first = docstring.strip().partition("\n")[0]
-    return "" if _SIGNATURE.match(first) else _one_line(first)
 
 
 def _facts(param: Range) -> str:

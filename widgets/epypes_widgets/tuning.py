@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from time import perf_counter_ns
 from typing import Any, Final
@@ -16,7 +16,7 @@ from typing import Any, Final
 from epypes.errors import NotComputed, StillRunning
 from epypes.graph import subgraph
 from epypes.run import Failure, Run
-from epypes_widgets.control_set import ControlSet
+from epypes_widgets.controls import ControlSet
 from epypes_widgets.frame_states import Superseded
 from epypes_widgets.frames import thumbnail
 from epypes_widgets.history import Entry, History
@@ -66,10 +66,9 @@ class Tuning:
         self.controls, self.session, self.history, self.screen = controls, session, history, screen
         self.runner, self.worker = session.runner, worker
         self.is_live = True
-        self._settled = settled
+        self._settled, self._is_superseded = settled, partial(worker.is_superseded, "compute")
         self._lock = threading.Lock()
         self._commits = self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
-        self._has_progress = False
         self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
         for control in controls.controls:
             control.on_change(self._moved)
@@ -100,7 +99,7 @@ class Tuning:
                 self.controls.release()
                 run = self.session.result
                 if run is not None:
-                    self._log(self.controls.follow(run.hyperparameters))
+                    self.screen.log(*self.controls.follow(run.hyperparameters))
                     self.screen.show(run, 0)
                 self.screen.close(_CLOSED)
                 self._settled()
@@ -114,6 +113,13 @@ class Tuning:
         with self._lock:  # of two threads the one whose value stands is wanted last
             self.session.want(self.controls.set(values, by_user=by_user))
         self._wanted(commit=commit)
+
+    def first_values(self, names: Sequence[str] = ()) -> dict[str, Any]:
+        """Return the values that the runner had hyperparameters frozen with, by name; all without names."""
+        first = self.runner.first_hyperparameters
+        for name in names:
+            self.controls.control(name)
+        return {name: first[name] for name in names or self.controls.values if name in first}
 
     def want_image(self, index: int, *, commit: bool = True) -> None:
         """Have another payload computed; IndexError if there is none."""
@@ -129,7 +135,7 @@ class Tuning:
     def release(self) -> None:
         """Commit what the user has released."""
         waited, refused = self.controls.release()
-        self._log(refused)
+        self.screen.log(*refused)
         if waited:
             self.session.want(waited)
             self._request()
@@ -151,7 +157,7 @@ class Tuning:
             return False
         values = {name: value for name, value in entry.values.items() if name in self.runner.hyperparameters}
         with self._lock:
-            self._log(self.controls.follow(values))
+            self.screen.log(*self.controls.follow(values))
             self.session.want(values)
         if entry.image not in (None, self.session.image_wanted) and entry.image in range(len(self.session.payloads)):
             self.session.want_image(entry.image or 0)
@@ -201,13 +207,6 @@ class Tuning:
     def _request(self) -> None:
         self.worker.post("compute", partial(self._compute, perf_counter_ns()))
 
-    def _tell_progress(self, text: str) -> None:
-        self._has_progress = bool(text)
-        self.screen.note(text)
-
-    def _is_superseded(self) -> bool:
-        return self.worker.is_superseded("compute")
-
     def _runner_changed(self) -> None:
         if not self.worker.is_current:
             self.screen.refer_anew()
@@ -220,10 +219,6 @@ class Tuning:
 
     def _commit_later(self, delay_s: float) -> None:
         self.worker.post("commit", self._commit, delay_s)
-
-    def _log(self, sentences: Iterable[str]) -> None:
-        for sentence in sentences:
-            self.screen.log(sentence)
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
@@ -256,8 +251,6 @@ class Tuning:
             return
         if self.worker.closed:
             return
-        if self._has_progress:
-            self._tell_progress("")
         if run.failure is not None:
             self._fail(run, run.failure)
             return
@@ -278,7 +271,7 @@ class Tuning:
                 self.screen.shown.targets,
                 is_wanted=is_wanted,
                 is_superseded=self._is_superseded,
-                report=self._tell_progress,
+                report=self.screen.note,
             )
             if is_settled:
                 break
@@ -316,7 +309,7 @@ class Tuning:
         if changed:
             if self.session.is_service:
                 self._show_conflict(wanted, changed)
-            self._log(self.controls.follow(changed))
+            self.screen.log(*self.controls.follow(changed))
             self._commit_later(REST_S)
         return bool(changed)
 
@@ -360,7 +353,7 @@ class Tuning:
 
     def _add(self, run: Run) -> None:
         current, image = self.history.current, self.session.image
-        if not self.session.payloads and current is not None:
+        if not len(self.session.payloads) and current is not None:
             image = current.image  # that of another panel on this runner
         token = self.screen.shown.token
         about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms}

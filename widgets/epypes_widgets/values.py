@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from epypes.display.previews.model import Look
+from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import short_repr
 from epypes.run.guard import is_array

@@ -7,11 +7,11 @@ request goes into a slot under its key and replaces the one that waits there, an
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from collections.abc import Callable
+from operator import attrgetter
 from time import monotonic
-from typing import Final
+from typing import Final, NamedTuple
 
 from epypes.errors import StillRunning
 
@@ -19,27 +19,36 @@ _LOG: Final = logging.getLogger(__name__)
 _IDLE_S: Final = 60.0
 
 
+class _Request(NamedTuple):
+    """What waits under a key, from when on it may run, and whether ``Worker.wait`` waits for it."""
+
+    key: str
+    call: Callable[[], object]
+    due_s: float
+    is_work: bool
+
+
 class Worker:
     """Runs requests on a thread of its own, the latest of each key.
 
     Parameters
     ----------
-    failed
-        Is called on the worker's thread with what a request has raised.
     name
         Of the thread.
+    failed
+        Is called on the worker's thread with what a request has raised; without, that is logged.
 
     Notes
     -----
     The thread is a daemon. It starts at the first request, and ends when there was none for a minute.
     """
 
-    def __init__(self, failed: Callable[[BaseException], None], name: str = "epypes-panel") -> None:
-        self._failed, self._name = failed, name
+    def __init__(self, name: str = "epypes-panel", failed: Callable[[BaseException], None] | None = None) -> None:
+        self._name, self._failed = name, failed or self._log
         self._condition = threading.Condition()
         self._closed = False
         self._running: str | None = None
-        self._waiting: dict[str, tuple[float, Callable[[], object], bool]] = {}
+        self._waiting: dict[str, _Request] = {}
         # When the thread wakes by itself; 0 while it is awake.
         self._wakes_s = 0.0
         self._thread: threading.Thread | None = None
@@ -80,7 +89,7 @@ class Worker:
             if self._closed:
                 return
             due_s = monotonic() + delay_s if delay_s else 0.0
-            self._waiting[key] = (due_s, request, is_work)
+            self._waiting[key] = _Request(key, request, due_s, is_work)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._work, name=self._name, daemon=True)
                 self._thread.start()
@@ -101,7 +110,7 @@ class Worker:
             raise RuntimeError("A function of the graph can't wait for the panel that runs it.")
         with self._condition:
             if not self._condition.wait_for(self._is_done, timeout_s):
-                raise TimeoutError(f"The panel is still computing after {timeout_s:g} s. Wait longer.")
+                raise TimeoutError(f"{self._name} is still computing after {timeout_s:g} s. Wait longer.")
 
     def close(self, timeout_s: float) -> None:
         """Drop what waits and end the thread; may be called twice, and from any thread.
@@ -123,7 +132,10 @@ class Worker:
             raise StillRunning(self._name, (), timeout_s)
 
     def _is_done(self) -> bool:
-        return self._running is None and not any(is_work for _, _, is_work in self._waiting.values())
+        return self._running is None and not any(request.is_work for request in self._waiting.values())
+
+    def _log(self, error: BaseException) -> None:
+        _LOG.error("Work on the thread %s has failed", self._name, exc_info=error)
 
     def _work(self) -> None:
         while (request := self._next()) is not None:
@@ -141,14 +153,14 @@ class Worker:
             self._running = None
             self._condition.notify_all()
             while not self._closed:
-                key = min(self._waiting, key=lambda key: self._waiting[key][0], default=None)
-                due_s = math.inf if key is None else self._waiting[key][0]
-                wait_s = due_s - monotonic()
-                if key is not None and wait_s <= 0:
-                    self._running = key
-                    return self._waiting.pop(key)[1]
-                self._wakes_s = due_s
-                is_notified = self._condition.wait(min(wait_s, _IDLE_S))
+                request = min(self._waiting.values(), key=attrgetter("due_s"), default=None)
+                now_s = monotonic()
+                if request is not None and request.due_s <= now_s:
+                    self._running = request.key
+                    del self._waiting[request.key]
+                    return request.call
+                self._wakes_s = now_s + _IDLE_S if request is None else request.due_s
+                is_notified = self._condition.wait(self._wakes_s - now_s)
                 self._wakes_s = 0.0
                 if not is_notified and not self._waiting:
                     break

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import io
-import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
@@ -17,10 +16,16 @@ from typing import TYPE_CHECKING, Any, Final
 from xml.etree import ElementTree
 
 from epypes.display.paint.style import paper_declarations
-from epypes.optional import optional_import
+from epypes.optional import LazyModule, optional_import
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib import axes, figure, font_manager, patches, path, textpath
+    from PIL import Image
+else:
+    figure, font_manager, patches, path, textpath = (
+        LazyModule(f"matplotlib.{name}") for name in ("figure", "font_manager", "patches", "path", "textpath")
+    )
+    Image = LazyModule("PIL.Image")
 
 # Pixels of SVG per inch of paper; then a line of 1 px is a line of 1 pt.
 _PX_PER_INCH: Final = 72
@@ -30,9 +35,8 @@ _MOST_PNG_PX: Final = 20_000
 # What the layout gives a character, and a line beside its characters.
 _CHARACTER_PX: Final = 6.9
 _BESIDE_PX: Final = 12.0
-_NUMBER: Final = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_COMMAND: Final = re.compile(rf"([MLHVCAZmlhvcaz])|({_NUMBER})")
-_NUMBERS_OF: Final = {"m": 2, "l": 2, "h": 1, "v": 1, "c": 6, "a": 7, "z": 0}
+_COMMAND: Final = re.compile("([MLHVCZlhvcz])([^A-Za-z]*)")
+_NUMBER: Final = re.compile(r"-?[\d.]+")
 # Whatever a user has set for plots.
 _PLAIN: Final[Any] = {"text.usetex": False, "path.sketch": None, "path.effects": [], "pdf.fonttype": 42}
 
@@ -40,7 +44,7 @@ Point = tuple[float, float]
 Style = Mapping[str, str]
 
 
-def save_on_paper(svg: str, path: Path) -> None:
+def save_on_paper(svg: str, file: Path) -> None:
     """Write a painted graph as PNG or PDF, by the ending of the path, on white.
 
     Raises
@@ -50,30 +54,29 @@ def save_on_paper(svg: str, path: Path) -> None:
     """
     with optional_import():
         import matplotlib as mpl
-        from matplotlib.figure import Figure
 
     root = ElementTree.fromstring(svg)  # noqa: S314 - our own text
     left, top, width, height = map(float, root.attrib["viewBox"].split())
-    kind = path.suffix[1:]
+    kind = file.suffix[1:]
     scale = min(_PNG_SCALE, _MOST_PNG_PX / max(width, height)) if kind == "png" else 1.0
     # Without times and versions, so that the same picture is the same file.
     metadata = {"Software": None} if kind == "png" else {"CreationDate": None, "Producer": None}
     with mpl.rc_context(_PLAIN), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure = Figure(figsize=(width / _PX_PER_INCH, height / _PX_PER_INCH), facecolor="white")
-        axes = figure.add_axes((0, 0, 1, 1))
-        axes.set_axis_off()
-        axes.set_xlim(left, left + width)
-        axes.set_ylim(top + height, top)
-        _Painter(axes).paint(root)
-        figure.savefig(path, format=kind, dpi=_PX_PER_INCH * scale, metadata=metadata)
+        page = figure.Figure(figsize=(width / _PX_PER_INCH, height / _PX_PER_INCH), facecolor="white")
+        drawn = page.add_axes((0, 0, 1, 1))
+        drawn.set_axis_off()
+        drawn.set_xlim(left, left + width)
+        drawn.set_ylim(top + height, top)
+        _Painter(drawn).paint(root)
+        page.savefig(file, format=kind, dpi=_PX_PER_INCH * scale, metadata=metadata)
 
 
 class _Painter:
     """Draws the elements of an SVG into axes, one above the other."""
 
-    def __init__(self, axes: Axes) -> None:
-        self._axes = axes
+    def __init__(self, drawn: axes.Axes) -> None:
+        self._axes = drawn
         self._above = 0
         self._draw = {
             "rect": self._rectangle,
@@ -86,10 +89,10 @@ class _Painter:
             "image": self._image,
         }
 
-    def paint(self, element: ElementTree.Element, around: tuple[tuple[str, frozenset[str]], ...] = ()) -> None:
+    def paint(self, element: ElementTree.Element, around: tuple[set[str], ...] = ()) -> None:
         """Draw an element and all in it; ``around`` are tag and classes of those that it is in."""
         tag = element.tag.rpartition("}")[2]
-        own = tag, frozenset(element.get("class", "").split())
+        own = {tag, *(f".{name}" for name in element.get("class", "").split())}
         draw = self._draw.get(tag)
         if draw is not None:
             written = dict(part.split(":", 1) for part in element.get("style", "").split(";") if part)
@@ -122,51 +125,40 @@ class _Painter:
         self._axes.add_artist(patch)
 
     def _rectangle(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import FancyBboxPatch
-
         x, y, width, height = (_number(element, name) for name in ("x", "y", "width", "height"))
         radius = min(_number(element, "rx"), width / 2, height / 2)
         corners = f"round,pad=0,rounding_size={radius:.3f}" if radius else "square,pad=0"
-        self._add(FancyBboxPatch((x, y), width, height, boxstyle=corners), style)
+        self._add(patches.FancyBboxPatch((x, y), width, height, boxstyle=corners), style)
 
     def _ellipse(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import Ellipse
-
         across, down = (_number(element, name) or _number(element, "r") for name in ("rx", "ry"))
-        self._add(Ellipse((_number(element, "cx"), _number(element, "cy")), 2 * across, 2 * down), style)
+        self._add(patches.Ellipse((_number(element, "cx"), _number(element, "cy")), 2 * across, 2 * down), style)
 
     def _polygon(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import Polygon
-
-        numbers = [float(number) for number in re.findall(_NUMBER, element.attrib["points"])]
-        points = list(zip(numbers[::2], numbers[1::2], strict=True))
-        if points:
-            self._add(Polygon(points, closed=element.tag.endswith("polygon")), style)
+        end = "Z" if element.tag.endswith("polygon") else ""
+        self._add_path(f"M{element.attrib['points'].replace(' ', 'L')}{end}", style)
 
     def _path(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.patches import PathPatch
-        from matplotlib.path import Path as Curve
+        self._add_path(element.attrib["d"], style)
 
-        steps = [*_steps(element.attrib["d"])]
+    def _add_path(self, written: str, style: Style) -> None:
+        steps = [*_steps(written)]
         if steps:
             points, codes = zip(*steps, strict=True)
-            self._add(PathPatch(Curve(points, codes)), style)
+            self._add(patches.PathPatch(path.Path(points, codes)), style)
 
     def _text(self, element: ElementTree.Element, style: Style) -> None:
-        from matplotlib.font_manager import FontProperties
-        from matplotlib.textpath import TextPath
-
         text = "".join(element.itertext())
         if not text.strip():
             return
         is_row = "monospace" in style.get("font", "")
         size = float(style.get("font-size", "10px" if is_row else "12px").removesuffix("px"))
-        font = FontProperties(
+        font = font_manager.FontProperties(
             family="DejaVu Sans Mono" if is_row else "DejaVu Sans",
             weight="bold" if int(style.get("font-weight", 400)) >= 600 else "normal",
         )
         # These letters are wider than those of most screens.
-        written = TextPath((0, 0), text.replace("$", "S"), size, prop=font).get_extents().width or 1.0
+        written = textpath.TextPath((0, 0), text.replace("$", "S"), size, prop=font).get_extents().width or 1.0
         room = len(text) * _CHARACTER_PX * size / 12 + _BESIDE_PX
         self._axes.text(
             _number(element, "x"),
@@ -182,18 +174,14 @@ class _Painter:
         )
 
     def _image(self, element: ElementTree.Element, style: Style) -> None:
-        with optional_import():
-            from PIL import Image, UnidentifiedImageError
-        from matplotlib.patches import Rectangle
-
         x, y, width, height = (_number(element, name) for name in ("x", "y", "width", "height"))
         data = base64.b64decode(element.attrib["href"].partition(",")[2])
         try:
             with Image.open(io.BytesIO(data)) as picture:
                 pixels = picture.convert("RGBA")
-        except UnidentifiedImageError:
+        except OSError:
             # What a preview of a user's own gives may be a drawing.
-            self._add(Rectangle((x, y), width, height), {"fill": "#e6e8eb"})
+            self._add(patches.Rectangle((x, y), width, height), {"fill": "#e6e8eb"})
             return
         opacity = float(style.get("opacity", 1))
         shown = self._axes.imshow(
@@ -211,50 +199,20 @@ def _number(element: ElementTree.Element, name: str) -> float:
 def _steps(written: str) -> Iterator[tuple[Point, int]]:
     """Give the points of a path with Matplotlib's code for each: 1 moves, 2 is a line, 4 a curve, 79 closes."""
     at = start = (0.0, 0.0)
-    for name, numbers in _commands(written):
-        kind, x, y = name.lower(), *(at if name.islower() else (0.0, 0.0))
+    for name, text in _COMMAND.findall(written):
+        kind, numbers = name.lower(), [float(number) for number in _NUMBER.findall(text)]
+        x, y = at if name.islower() else (0.0, 0.0)
         if kind == "z":
             at = start
             yield at, 79
-        elif kind == "a":
-            end = x + numbers[5], y + numbers[6]
-            yield from _arc(at, end, numbers[0], is_large=bool(numbers[3]), is_sweep=bool(numbers[4]))
-            at = end
+            continue
+        if kind == "h":
+            points = [(x + numbers[0], at[1])]
+        elif kind == "v":
+            points = [(at[0], y + numbers[0])]
         else:
-            if kind in "hv":
-                numbers = (numbers[0], 0.0 if name.islower() else at[1])
-                numbers = numbers if kind == "h" else (0.0 if name.islower() else at[0], numbers[0])
             points = [(x + dx, y + dy) for dx, dy in zip(numbers[::2], numbers[1::2], strict=True)]
-            for point in points:
-                yield point, {"m": 1, "c": 4}.get(kind, 2)
-            at = points[-1]
-            start = at if kind == "m" else start
-
-
-def _commands(written: str) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Give the commands of a path with their numbers; one that is repeated is written once."""
-    name, numbers = "", list[float]()
-    for command, number in _COMMAND.findall(written):
-        if command:
-            name, numbers = command, []
-        else:
-            numbers.append(float(number))
-        if len(numbers) == _NUMBERS_OF[name.lower()]:
-            yield name, tuple(numbers)
-            name, numbers = {"M": "L", "m": "l"}.get(name, name), []
-
-
-def _arc(start: Point, end: Point, radius: float, *, is_large: bool, is_sweep: bool) -> Iterator[tuple[Point, int]]:
-    """Give an arc of a circle as lines."""
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    half = math.hypot(dx, dy) / 2
-    away = math.sqrt(max(radius**2 - half**2, 0.0)) * (-1 if is_large == is_sweep else 1)
-    centre = (
-        (start[0] + end[0]) / 2 - away * dy / (2 * half),
-        (start[1] + end[1]) / 2 + away * dx / (2 * half),
-    )
-    first, last = (math.atan2(y - centre[1], x - centre[0]) for x, y in (start, end))
-    turn = (last - first) % math.tau if is_sweep else -((first - last) % math.tau)
-    for step in range(1, 25):
-        angle = first + turn * step / 24
-        yield (centre[0] + radius * math.cos(angle), centre[1] + radius * math.sin(angle)), 2
+        for point in points:
+            yield point, {"m": 1, "c": 4}.get(kind, 2)
+        at = points[-1]
+        start = at if kind == "m" else start

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Final
 
@@ -54,8 +54,8 @@ _RULES: Final = {
     " .stale image": "opacity:.35",
     " .stale .chart": "opacity:.5",
     " .row": "font:10px ui-monospace,monospace;fill:@quiet;text-anchor:start;white-space:pre",
-    " .chart .paper": "fill:@grey",
-    " .chart>:not(.paper)": "fill:none;stroke:@accent",
+    " .chart .paper": "fill:@grey;stroke:none",
+    " .chart *": "fill:none;stroke:@accent",
     " .chart .dots": "stroke-width:3;stroke-linecap:round",
     " .function .inner": "fill:none;stroke-width:1",
     " .edge": "fill:none;stroke:@line",
@@ -95,42 +95,31 @@ def _named(declarations: str) -> str:
     return re.sub(r"@(\w+)", r"var(--epypes-\1)", declarations)
 
 
-def paper_declarations(path: Sequence[tuple[str, Collection[str]]]) -> dict[str, str]:
+def paper_declarations(path: Sequence[set[str]]) -> dict[str, str]:
     """Return what the rules say of an element on paper: by property, the declaration that counts.
 
     Parameters
     ----------
     path
-        Tag and classes of the elements that it is in, and of itself.
+        Of the elements that it is in, and of itself, the tag and the classes: ``{"rect", ".shape"}``.
     """
     found: dict[str, str] = {}
-    for selector, declarations in _by_weight():
-        if _selects(selector, path):
-            found |= dict(part.split(":", 1) for part in declarations.split(";"))
+    for (*outer, last), declarations in _by_weight():
+        around = iter(path[:-1])
+        # The last part means the element itself, the others mean elements around it, in this order.
+        if last <= path[-1] and all(any(part <= element for element in around) for part in outer):
+            found |= declarations
     return found
 
 
 @cache
-def _by_weight() -> list[tuple[list[str], str]]:
+def _by_weight() -> list[tuple[list[set[str]], dict[str, str]]]:
     """Return selectors, as the parts that are inside each other, and declarations; those that count more come later."""
-    rules = [(re.split("[ >]", name)[1:], _coloured(declared)) for name, declared in _RULES.items() if name]
-    return sorted(rules, key=lambda rule: ("".join(rule[0]).count("."), len(rule[0])))
-
-
-def _selects(parts: Sequence[str], path: Sequence[tuple[str, Collection[str]]]) -> bool:
-    """Whether the last part means the last element, and the others mean elements around it, in this order."""
-    *outer, last = parts
-    if not path or not _means(last, *path[-1]):
-        return False
-    around = iter(path[:-1])
-    return all(any(_means(part, *element) for element in around) for part in outer)
-
-
-def _means(part: str, tag: str, classes: Collection[str]) -> bool:
-    if part.startswith(":not"):
-        return not _means(part[5:-1], tag, classes)
-    wanted, *names = part.split(".")
-    return (not wanted or wanted == tag) and all(name in classes for name in names)
+    rules = [
+        ([set(re.findall(r"\.?[\w-]+", part)) for part in selector.split()], _coloured(declarations))
+        for selector, declarations in sorted(_RULES.items(), key=lambda rule: (rule[0].count("."), rule[0].count(" ")))
+    ]
+    return [(parts, dict(each.split(":", 1) for each in text.split(";"))) for parts, text in rules if parts]
 
 
 # A viewer that knows no variables skips the second part, and has what stands on paper.

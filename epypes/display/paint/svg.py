@@ -10,15 +10,24 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from statistics import fmean
 from typing import Final
 
-from epypes.display.layout.geometry import Edge, Layout, Point
-from epypes.display.layout.placement import lay_out
-from epypes.display.paint.stages import paint_around
+from epypes.display.layout import Edge, Layout, Point, lay_out
 from epypes.display.paint.style import STYLE
-from epypes.display.paint.vertices import function_box, paint_function, paint_token, token_box
-from epypes.display.text import escape, fitted, short_name
-from epypes.display.views.graphview import EdgeView, GraphView
+from epypes.display.paint.vertices import (
+    LINE_PX,
+    Bounds,
+    function_box,
+    paint_function,
+    paint_stage,
+    paint_token,
+    stage_size,
+    text_width,
+    token_box,
+)
+from epypes.display.text import content, escape, fitted, short_name
+from epypes.display.views.graphview import EdgeView, GraphView, StageView
 from epypes.display.views.groups import function_count
 from epypes.wording import counted
 
@@ -72,19 +81,12 @@ def _without_stops(spline: Sequence[Point]) -> list[Point]:
     way = list(spline[:1])
     for first in range(0, len(spline) - 1, 3):
         curve = spline[first : first + 4]
-        if _is_straight(way[-4:]) and _is_straight(curve) and _are_in_line(way[-4], *curve[::3]):
+        are_straight = all(len(each) == 4 and each[0] == each[1] and each[2] == each[3] for each in (way[-4:], curve))
+        if are_straight and any(len(set(along)) == 1 for along in zip(way[-4], *curve[::3], strict=True)):
             way[-2:] = curve[2:]
         else:
             way += curve[1:]
     return way
-
-
-def _is_straight(curve: Sequence[Point]) -> bool:
-    return len(curve) == 4 and curve[0] == curve[1] and curve[2] == curve[3]
-
-
-def _are_in_line(*points: Point) -> bool:
-    return any(len(set(along)) == 1 for along in zip(*points, strict=True))
 
 
 def _curves(spline: Sequence[Point]) -> list[tuple[str, str]]:
@@ -127,6 +129,118 @@ def _arrow(end: Point, tip: Point) -> str:
     return "L".join(f"{x:.1f},{y:.1f}" for x, y in corners)
 
 
+# -- around the graph ----------------------------------------------------------------------------------------------
+#
+# A pipeline has a frame with its name, and the stages that events pass. The graph stays where the layout has put it,
+# with its corner at (0, 0); what is around it has negative coordinates too.
+
+_PADDING_PX: Final = 16.0
+_TITLE_PX: Final = 22.0
+_TITLE_ROOM: Final = 600
+# Between stages, and between them and the frame.
+_GAP_PX: Final = 26.0
+_TIP_PX: Final = 8.0
+
+
+def _paint_around(graph: GraphView, layout: Layout) -> tuple[list[str], Bounds]:
+    """Paint what is around a graph, if there is anything.
+
+    Returns
+    -------
+    tuple
+        The elements, and what they and the graph cover.
+    """
+    inside = Bounds(0.0, 0.0, layout.width, layout.height)
+    if not (graph.title or graph.before or graph.after):
+        return [], inside
+    title_px, is_turned = text_width(short_name(graph.title)), graph.direction == "right"
+    more = max(title_px + 2 * _GAP_PX - inside.right, 0.0) / 2 + _PADDING_PX
+    frame = Bounds(-more, -_PADDING_PX - _TITLE_PX / 2, inside.right + more, inside.bottom + _PADDING_PX)
+    left, top = frame.left + _PADDING_PX, frame.top - _TITLE_PX / 2
+    label = Bounds(left, top, left + title_px, top + _TITLE_PX)
+    parts, covered = _paint_frame(graph.title, frame, label), frame.holding(label)
+    payload = [place for place, token in enumerate(graph.tokens) if token.role == "payload"]
+    for stages, is_before in ((graph.before, True), (graph.after, False)):
+        if stages:
+            # Those at the free source tokens, or at the sink tokens.
+            inner = {edge.token for edge in graph.edges if edge.is_input != is_before}
+            centres = [layout.centres[len(graph.functions) + place] for place in payload if place not in inner]
+            # An arrow from above must not hit the title.
+            free_from = label.right if is_before and not is_turned else None
+            painted, taken = _paint_stages(stages, frame, centres, free_from, is_before, is_turned)
+            parts += painted
+            covered = covered.holding(taken)
+    return parts, covered
+
+
+def _paint_frame(title: str, frame: Bounds, label: Bounds) -> list[str]:
+    """Paint the frame, and the title on a label that lies on its upper border."""
+    size = f'width="{frame.right - frame.left:.1f}" height="{frame.bottom - frame.top:.1f}"'
+    parts = [f'<rect class="frame" x="{frame.left:.1f}" y="{frame.top:.1f}" {size} rx="8"/>']
+    if title:
+        width = label.right - label.left
+        parts.append(
+            f'<g class="label"><title>{content(fitted(f"pipeline {title}", _TITLE_ROOM))}</title>'
+            f'<rect class="shape" x="{label.left:.1f}" y="{label.top:.1f}" width="{width:.1f}" '
+            f'height="{_TITLE_PX:.0f}" rx="5"/>'
+            f'<text class="name" x="{label.left + width / 2:.1f}" y="{frame.top + LINE_PX / 4:.1f}">'
+            f"{content(short_name(title))}</text></g>"
+        )
+    return parts
+
+
+def _paint_stages(
+    stages: Sequence[StageView],
+    frame: Bounds,
+    tokens: Sequence[Point],
+    free_from: float | None,
+    is_before: bool,
+    is_turned: bool,
+) -> tuple[list[str], Bounds]:
+    """Paint arrows and stages, side by side across the direction of flow; return what they cover, too.
+
+    Everything is computed for a flow from top to bottom, and turned for one from left to right.
+    """
+    frame = frame.turned() if is_turned else frame
+    sizes = [stage_size(stage)[:: -1 if is_turned else 1] for stage in stages]
+    widths, depth = [width for width, _ in sizes], max(depth for _, depth in sizes)
+    above = frame.top - _GAP_PX - depth - (0.0 if is_turned else _TITLE_PX / 2)
+    top = above if is_before else frame.bottom + _GAP_PX
+    bottom = top + depth
+    # The stage beside the frame is over the tokens, or moved so that all are over the frame.
+    nearest, length = -1 if is_before else 0, sum(widths) + _GAP_PX * (len(widths) - 1)
+    half, least, most = widths[nearest] / 2, (free_from or frame.left) + _PADDING_PX, frame.right - _PADDING_PX
+    leftmost, rightmost = frame.left + length - half, frame.right - length + half
+    if is_before and leftmost <= most:
+        least = max(least, leftmost)
+    elif not is_before and rightmost >= least:
+        most = min(most, rightmost)
+    x = fmean(point[is_turned] for point in tokens) if tokens else (frame.left + frame.right) / 2
+    x = min(max(x, least), most)
+    lefts = [x + half - length if is_before else x - half]
+    for width in widths[:-1]:
+        lefts.append(lefts[-1] + width + _GAP_PX)
+    arrows = [((left - _GAP_PX, (top + bottom) / 2), (left, (top + bottom) / 2)) for left in lefts[1:]]
+    start, end = (bottom, frame.top) if is_before else (frame.bottom, top)
+    arrows.append(((x, start), (x, end)))
+    parts, covered = [_paint_arrows(arrows, is_turned)], Bounds(lefts[0], top, lefts[-1] + widths[-1], bottom)
+    for stage, left, width in zip(stages, lefts, widths, strict=True):
+        box = Bounds(left, top, left + width, bottom)
+        parts.append(paint_stage(stage, box.turned() if is_turned else box))
+    return parts, covered.turned() if is_turned else covered
+
+
+def _paint_arrows(arrows: Sequence[tuple[Point, Point]], is_turned: bool) -> str:
+    lines, tips = "", ""
+    for start, end in arrows:
+        (x0, y0), (x1, y1) = (start[::-1], end[::-1]) if is_turned else (start, end)
+        lines += f"M{x0:.1f},{y0:.1f}L{x1:.1f},{y1:.1f}"
+        tips += f"M{x1:.1f},{y1:.1f}" + (f"l-{_TIP_PX:.0f},-3.5v7z" if x0 != x1 else f"l-3.5,-{_TIP_PX:.0f}h7z")
+    return f'<path class="edge around" d="{lines}"/><path class="tip around" d="{tips}"/>'
+
+
+# -- the whole -----------------------------------------------------------------------------------------------------
+
 # Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
 # Graphviz minutes and would fill the picture.
 _MANY_EDGES: Final = 150
@@ -158,7 +272,7 @@ def paint_svg(graph: GraphView) -> str:
     place = {token.name: functions + index for index, token in enumerate(graph.tokens)}
     back = tuple((place[token], place[to]) for token, to in graph.delays if token in place and to in place)
     layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction, back)
-    around, bounds = paint_around(graph, layout)
+    around, bounds = _paint_around(graph, layout)
     width, height = bounds.right - bounds.left + 2 * _MARGIN, bounds.bottom - bounds.top + 2 * _MARGIN
     size = f"{width:.0f}", f"{height:.0f}"
     box = f"{bounds.left - _MARGIN:.4g} {bounds.top - _MARGIN:.4g} {size[0]} {size[1]}"

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from epypes.display.paint.stages import stage_words
-from epypes.display.paint.times import TimesView, report_times, summary_times
+from epypes.display.paint.times import times_of
+from epypes.display.paint.vertices import stage_words
 from epypes.display.previews.short import reason
 from epypes.display.text import content, cut, cut_name, duration_text, fitted, size
 from epypes.display.views.graphview import FunctionView, GraphView, StageView, TokenView
@@ -45,13 +45,12 @@ def table_of(shown: Tabular) -> Table:
     """
     if isinstance(shown, Plan):
         return _plan_table(plan_view(shown))
-    if isinstance(shown, RunReport):
-        return _times_table(report_times(shown, _MOST_FUNCTIONS), ("function", "time", "share"))
-    summary = shown if isinstance(shown, TimingSummary) else summary_of(shown)
-    if isinstance(summary, str):
-        return Table(summary, (), ())
-    head = "function", "runs", "mode", "median", "5 % to 95 %"
-    return _times_table(summary_times(summary, _MOST_FUNCTIONS), head)
+    if isinstance(shown, Reports):
+        summary = summary_of(shown)
+        return Table(summary, (), ()) if isinstance(summary, str) else table_of(summary)
+    times = times_of(shown, _MOST_FUNCTIONS)
+    *bars, overhead, total = times.bars
+    return Table(times.caption, times.head, [(bar.name, *bar.cells) for bar in (*bars, total, overhead)])
 
 
 def summary_of(reports: Reports) -> TimingSummary | str:
@@ -63,11 +62,6 @@ def summary_of(reports: Reports) -> TimingSummary | str:
         return summarize(given)
     except ValueError as error:  # all runs have failed
         return str(error)
-
-
-def _times_table(times: TimesView, head: tuple[str, ...]) -> Table:
-    *bars, overhead, total = times.bars
-    return Table(times.caption, head, [(bar.name, *bar.cells) for bar in (*bars, total, overhead)])
 
 
 def _plan_table(graph: GraphView) -> Table:
@@ -112,7 +106,7 @@ def text_table(table: Table) -> str:
     """Write a table as aligned lines: its caption, its head, its rows."""
     if not table.head:
         return table.caption
-    lines = [[_printable(cut(cell, _CELL_CHARACTERS)) for cell in cells] for cells in (table.head, *table.rows)]
+    lines = [[cut(cell, _CELL_CHARACTERS) for cell in cells] for cells in (table.head, *table.rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     lines.insert(1, ["-" * width for width in widths])
     aligned = [
@@ -122,24 +116,30 @@ def text_table(table: Table) -> str:
         ).rstrip()
         for cells in lines
     ]
-    return "\n".join([*([_printable(table.caption)] if table.caption else []), *aligned])
-
-
-def _printable(text: str) -> str:
-    """Return text without what would steer a terminal."""
-    return "".join(character if character.isprintable() else "\ufffd" for character in text)
+    # Without what would steer a terminal.
+    return "\n".join(
+        "".join(mark if mark.isprintable() else "\ufffd" for mark in line)
+        for line in ([table.caption, *aligned] if table.caption else aligned)
+    )
 
 
 def paint_text(graph: GraphView) -> str:
     """Paint a graph as one line per function, in run order: ``canny(image_blurred, canny_lo, canny_hi) -> edges``."""
-    lines = [f"pipeline {graph.title}"] if graph.title else []
-    lines += map(_stage_line, graph.before)
+    before, after = (
+        [f"{stage.kind} {stage.name}  [{'; '.join(stage_words(stage))}]" for stage in stages]
+        for stages in (graph.before, graph.after)
+    )
+    lines = [f"pipeline {graph.title}", *before] if graph.title else before
     for (inputs, outputs), function in zip(graph.io(), graph.functions[:_MOST_LINES], strict=False):
-        line = f"{function.name}({', '.join(inputs)}) -> {', '.join(outputs) or 'nothing'}"
-        lines.append("  ".join(filter(None, (line, _state_mark(function), *function.notes, function.message))))
+        line, mark = f"{function.name}({', '.join(inputs)}) -> {', '.join(outputs) or 'nothing'}", ""
+        if function.duration_ns is not None:
+            mark = f"[{duration_text(function.duration_ns)}]"
+        elif function.state not in _UNWRITTEN:
+            mark = f"[{'to run' if function.state == 'planned' else function.state}]"
+        lines.append("  ".join(filter(None, (line, mark, *function.notes, function.message))))
     if len(graph.functions) > _MOST_LINES:
         lines.append(f"... and {len(graph.functions) - _MOST_LINES} functions more")
-    lines += map(_stage_line, graph.after)
+    lines += after
     values = [
         f"{token.name} = {token.preview.text}{f' (first {token.first})' * bool(token.first)}"
         for token in graph.tokens
@@ -150,17 +150,6 @@ def paint_text(graph: GraphView) -> str:
         if names:
             lines.append(f"{start} {', '.join(names[:_MOST_LINES])}")
     return "\n".join(lines)
-
-
-def _stage_line(stage: StageView) -> str:
-    return f"{stage.kind} {stage.name}  [{'; '.join(stage_words(stage))}]"
-
-
-def _state_mark(function: FunctionView) -> str:
-    if function.duration_ns is not None:
-        return f"[{duration_text(function.duration_ns)}]"
-    state = "to run" if function.state == "planned" else function.state
-    return "" if state in _UNWRITTEN else f"[{state}]"
 
 
 def repr_text(shown: object) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Final, Literal, NamedTuple
 
 from epypes.display.paint.style import STYLE, page_style, paper_style
@@ -55,11 +55,25 @@ class TimeBar(NamedTuple):
 
 
 class TimesView(NamedTuple):
-    """What is to be seen of times: bars in run order, then graph overhead and total; ``legend`` explains the bars."""
+    """What is to be seen of times: bars in run order, then graph overhead and total.
+
+    Attributes
+    ----------
+    legend
+        Explains the bars.
+    head
+        What stands above the names and cells in a table.
+    """
 
     caption: str
     legend: str
+    head: tuple[str, ...]
     bars: tuple[TimeBar, ...]
+
+
+def times_of(shown: RunReport | TimingSummary, most: int = MOST_BARS) -> TimesView:
+    """Look at the times of a run, or of many; of many functions at those that take longest."""
+    return report_times(shown, most) if isinstance(shown, RunReport) else summary_times(shown, most)
 
 
 def _named(kind: BarKind, name: str) -> str:
@@ -84,22 +98,19 @@ def report_times(report: RunReport, most: int = MOST_BARS) -> TimesView:
     bars.append(_bar("overhead", overhead_text(report.side_by_side), report.overhead_ns, total_ns))
     scale = max((bar.length for bar in bars), default=0.0) or 1.0
     total = duration_text(report.total_ns)
+    failed, skipped = sum(entry.failed for entry in entries), sum(entry.skipped for entry in entries)
+    caption = f"{counted(sum(entry.ran for entry in entries) - failed, 'function')} ran"
+    caption += f", {sum(entry.reused for entry in entries)} reused"
+    caption += f", {skipped} skipped" * bool(skipped) + f", {failed} failed" * failed
     return TimesView(
-        _report_caption(entries),
+        caption,
         _REPORT_LEGEND,
+        ("function", "time", "share"),
         (
             *(bar._replace(length=bar.length / scale) for bar in bars),
             TimeBar("total", "in all", total, f"in all: {total}", (total, "")),
         ),
     )
-
-
-def _report_caption(entries: tuple[FunctionTime, ...]) -> str:
-    """Return how many functions of a run ran to their end, how many were reused or skipped, and whether one failed."""
-    failed, skipped = sum(entry.failed for entry in entries), sum(entry.skipped for entry in entries)
-    reused = sum(entry.reused for entry in entries)
-    ran = counted(sum(entry.ran for entry in entries) - failed, "function")
-    return f"{ran} ran, {reused} reused{f', {skipped} skipped' * bool(skipped)}{f', {failed} failed' * failed}"
 
 
 def _function_bar(entry: FunctionTime, total_ns: int) -> TimeBar:
@@ -127,8 +138,12 @@ def _bar(kind: BarKind, name: str, spent_ns: int, total_ns: int) -> TimeBar:
 def summary_times(summary: TimingSummary, most: int = MOST_BARS) -> TimesView:
     """Look at the times of many runs; of many functions at those that take longest."""
     functions = summary.functions
-    kept = set(sorted(functions, key=lambda name: -_median_ns(functions[name]))[:most])
-    scale = _scale_ns(fitted for fitted in (*functions.values(), summary.overhead) if fitted.is_fitted)
+    median_ns = {name: fitted.median_ns if fitted.is_fitted else 0.0 for name, fitted in functions.items()}
+    kept = set(sorted(functions, key=lambda name: -median_ns[name])[:most])
+    shown = [fitted for fitted in (*functions.values(), summary.overhead) if fitted.is_fitted]
+    longest_ns = max((fitted.median_ns for fitted in shown), default=1.0)
+    ranges_ns = [fitted.quantile_ns(0.95) for fitted in shown if fitted.has_range]
+    scale = min(max([longest_ns, *ranges_ns]), _LONGEST_RANGE * longest_ns)
     bars = [_fitted_bar("function", name, functions[name], scale) for name in functions if name in kept]
     if len(functions) > len(kept):
         text = f"{counted(len(functions) - len(kept), 'function')} more, which take less"
@@ -137,18 +152,7 @@ def summary_times(summary: TimingSummary, most: int = MOST_BARS) -> TimesView:
     bars.append(_fitted_bar("total", "in all", summary.total, scale)._replace(length=0.0, low=0.0, high=0.0))
     left_out = f", {counted(summary.failed_runs, 'failed run')} left out" * bool(summary.failed_runs)
     caption = f"{counted(summary.runs, 'run')}{left_out}; log-normal distributions"
-    return TimesView(caption, _SUMMARY_LEGEND, tuple(bars))
-
-
-def _median_ns(fitted: LogNormal) -> float:
-    return fitted.median_ns if fitted.is_fitted else 0.0
-
-
-def _scale_ns(fitted: Iterable[LogNormal]) -> float:
-    every = list(fitted)
-    median = max((one.median_ns for one in every), default=1.0)
-    longest = max((one.quantile_ns(0.95) for one in every if one.has_range), default=0.0)
-    return min(max(longest, median), _LONGEST_RANGE * median)
+    return TimesView(caption, _SUMMARY_LEGEND, ("function", "runs", "mode", "median", "5 % to 95 %"), tuple(bars))
 
 
 def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) -> TimeBar:

@@ -1,4 +1,4 @@
-"""Functions and tokens as SVG: their sizes and their elements.
+"""Functions, tokens and stages as SVG: their sizes and their elements.
 
 Layouts are kept by the sizes of vertices, so a size depends on the value as little as possible: thumbnails and rows
 stand in boxes of one size, and texts in fields that are wide enough for the next value, too. Elements are kept by what
@@ -12,10 +12,11 @@ import re
 import zlib
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Final
+from itertools import islice
+from typing import Final, NamedTuple
 
-from epypes.display.layout.geometry import Box, Direction, Point
-from epypes.display.previews.model import Chart, Picture, Preview
+from epypes.display.layout import Box, Direction, Point
+from epypes.display.previews import Chart, Picture, Preview
 from epypes.display.previews.short import float_text
 from epypes.display.text import (
     CHARACTERS_OF_A_VERTEX,
@@ -26,10 +27,11 @@ from epypes.display.text import (
     escape,
     fitted,
     short_name,
+    shortened,
     wrapped,
     written_length,
 )
-from epypes.display.views.graphview import FunctionView, TokenView
+from epypes.display.views.graphview import FunctionView, StageView, TokenView
 
 # Those of two graphs of 200 functions. Were all of them thumbnails, they would take 7 MB.
 _MOST_KEPT: Final = 1_000
@@ -46,6 +48,23 @@ _ROOM: Final = CHARACTERS_OF_A_VERTEX - 60
 _LEAST_TITLE: Final = 100
 _LINE_ROOM: Final = 110
 _NOT_PLAIN: Final = re.compile(r"[^A-Za-z0-9_.-]")
+
+
+class Bounds(NamedTuple):
+    """A rectangle, in pixels."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def holding(self, other: Bounds) -> Bounds:
+        """Return the smallest rectangle that both are in."""
+        return Bounds(*map(min, self[:2], other[:2]), *map(max, self[2:], other[2:]))
+
+    def turned(self) -> Bounds:
+        """Return it with x and y exchanged."""
+        return Bounds(self.top, self.left, self.bottom, self.right)
 
 
 def text_width(*lines: str) -> float:
@@ -298,7 +317,7 @@ def _kind(token: TokenView) -> str:
 
 def _rows(shown: Preview, left: float, top: float) -> str:
     """Paint rows with their blanks, which keep columns apart, in what they may take."""
-    rows = [row if len(row) <= _ROW_CHARACTERS else row[: _ROW_CHARACTERS - 1] + "…" for row in shown.rows[:_ROWS]]
+    rows = [shortened(row, _ROW_CHARACTERS) for row in shown.rows[:_ROWS]]
     return "".join(
         f'<text class="row" x="{left:.0f}" y="{top + place * _ROW_PX:.0f}">'
         f"{content(row if written_length(row) <= _ROW_ROOM else fitted(row, _ROW_ROOM))}</text>"
@@ -372,3 +391,74 @@ def _chart(chart: Chart, top: Point) -> str:
         thickness = min(0.8 * width / max(map(len, series), default=1), _WIDEST_BAR_PX) if any(series) else 1
         marks = f'<path class="bars" style="stroke-width:{thickness:.1f}" d="{bars}"/>'
     return f'<g class="chart">{frame}{marks}</g>'
+
+
+# -- stages --------------------------------------------------------------------------------------------------------
+
+# Beside the text: the slots of a queue, the arrow of a loop.
+_QUEUE_PX: Final = 26
+_LOOP_PX: Final = 24
+_SLOT_PX: Final = 7
+_STAGE_NOTE_CHARACTERS: Final = 30
+_STAGE_NOTE_LINES: Final = 2
+_STAGE_LINES: Final = 8
+_STAGE_TITLE_CHARACTERS: Final = 300
+# The arrow of a loop: nine tenths of a circle.
+_CIRCLE: Final = (
+    "c-1.9,-2.9 -5.7,-3.9 -8.8,-2.4c-3.1,1.5 -4.7,5.0 -3.7,8.3c1.0,3.3 4.3,5.4 7.7,4.9c3.4,-0.5 6.0,-3.4 6.0,-6.9"
+)
+# Counts grow from picture to picture: a few digits more are not to move anything.
+_WIDTH_STEP: Final = 4
+_STAGE_STATES: Final = {
+    ("loop", "running"): "listening",
+    ("loop", "stopped"): "stopped",
+    ("function", "running"): "running",
+    ("function", "failed"): "failed",
+    ("queue", "running"): "put waits for room",
+}
+
+
+def stage_words(stage: StageView) -> tuple[str, ...]:
+    """Return the state of a stage, where it has one, and its notes."""
+    state = _STAGE_STATES.get((stage.kind, stage.state), "" if stage.state == "static" else stage.state)
+    return (state, *stage.notes) if state else stage.notes
+
+
+def _stage_lines(stage: StageView) -> tuple[str, ...]:
+    words = (line for text in stage_words(stage) for line in wrapped(text, _STAGE_NOTE_CHARACTERS, _STAGE_NOTE_LINES))
+    return short_name(stage.name), *islice(words, _STAGE_LINES)
+
+
+def stage_size(stage: StageView) -> Point:
+    """Return the width and height of a stage."""
+    lines = _stage_lines(stage)
+    widest = max(map(len, lines))
+    widest += -widest % _WIDTH_STEP
+    extra = {"queue": _QUEUE_PX, "loop": _LOOP_PX}.get(stage.kind, 0)
+    return text_width(" " * widest) + extra, LINE_PX * len(lines) + 14
+
+
+def paint_stage(stage: StageView, bounds: Bounds) -> str:
+    """Paint a stage as an element with its title."""
+    x, y, right, bottom = bounds
+    width, height, middle = right - x, bottom - y, (y + bottom) / 2
+    at = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}"'
+    if stage.kind == "queue":
+        # Open at its ends, with slots where its items leave.
+        slots = "".join(f"M{right - place * _SLOT_PX - 1:.1f},{y:.1f}v{height:.1f}" for place in range(3))
+        body = f'<rect class="shape open" {at}/><path class="mark" d="M{x:.1f},{y:.1f}H{right:.1f}'
+        body += f'M{x:.1f},{bottom:.1f}H{right:.1f}{slots}"/>'
+        text_middle = x + (width - _QUEUE_PX) / 2 + 3
+    elif stage.kind == "loop":
+        # Round at its ends, with an arrow that runs in a circle.
+        left = x + 21
+        body = f'<rect class="shape" {at} rx="{height / 2:.1f}"/>'
+        body += f'<path class="mark" d="M{left + 6:.1f},{middle - 4:.1f}{_CIRCLE}"/>'
+        body += f'<path class="tip" d="M{left + 8.5:.1f},{middle - 8:.1f}v6h-6z"/>'
+        text_middle = x + width / 2 + _LOOP_PX / 2 - 2
+    else:
+        body, text_middle = f'<rect class="shape" {at} rx="3"/>', x + width / 2
+    body += text_lines(_stage_lines(stage), (text_middle, middle))
+    kind = "call" if stage.kind == "function" else stage.kind
+    title = f"{stage.kind} {stage.name}: {'; '.join(stage_words(stage))}"
+    return vertex("stage", stage.name, (kind, stage.state), title, body, more=_STAGE_TITLE_CHARACTERS)

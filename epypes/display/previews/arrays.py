@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.drawing import bar_chart, line_chart
+from epypes.display.previews import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
+from epypes.display.previews.drawing import bar_chart, line_chart, point_sketch, quad_sketch, segment_sketch
 from epypes.display.previews.encoding import encode_small, is_pooled, pillow_image
-from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
 from epypes.display.previews.images import (
     few_of,
     image_kind,
@@ -20,15 +20,17 @@ from epypes.display.previews.images import (
     statistics_text,
 )
 from epypes.display.previews.introspection import is_of
-from epypes.display.previews.model import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
 from epypes.display.previews.objects import record_sketch
-from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
 from epypes.display.text import cut
+from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
-    from epypes.display.previews.model import Array
+    import numpy as np
 
+    from epypes.display.previews import Array
+else:
+    np = LazyModule("numpy")
 
 _MOST_ELONGATED: Final = 6
 _SMALL_SIDE: Final = 4
@@ -39,8 +41,7 @@ _LEAST_BINS: Final = 8
 _PLACES: Final = ((2,), (1, 2), (1, 4), (4,))
 
 
-@built_in("numpy.generic")
-def _number_sketch(number: Any, look: Look) -> Preview:
+def number_preview(number: Any, look: Look) -> Preview:
     """Look at a number of numpy, which has a dtype and no axes."""
     if number.dtype.kind in "mM":
         return Preview(str(number), f"{number.dtype} {number}")
@@ -51,17 +52,14 @@ def _number_sketch(number: Any, look: Look) -> Preview:
 
 def plain_array(array: Any) -> Array:
     """Return an array without what a subclass of numpy's makes of it."""
-    import numpy as np
-
     return np.asarray(array)
 
 
-@built_in("numpy.ndarray")
-def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
+def array_sketch(array: Any, look: Look) -> Sketch | Preview:
     """Look at an array by its shape and dtype."""
     array = plain_array(array)
     if not array.ndim:
-        return _number_sketch(array, look)
+        return number_preview(array, look)
     if array.dtype.names:
         return record_sketch(array)
     if array.dtype.kind not in "biuf" or not array.size:
@@ -95,7 +93,7 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     """Look at an array that is an image."""
     sample = sampled(array)
     kind = image_kind(array, sample)
-    ends = look.range_of(array)
+    ends = look.around.range_of(array)
     text = array_text(array) + _order_text(array, look)
     detail, note = [text, statistics_text(sample, array)], ""
     if kind == "labels":

@@ -15,32 +15,25 @@ import zlib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.display.previews import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
 from epypes.display.previews.images import Range, display_range, image_kind, is_mask, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
-from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
-from epypes.optional import optional_import
+from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
     from PIL import Image
 
-    from epypes.display.previews.model import Array
+    from epypes.display.previews import Array
     from epypes.images import Order
+else:
+    np, Image = LazyModule("numpy"), LazyModule("PIL.Image")
 
 JPEG_QUALITY: Final = 80
 _QUALITIES: Final = (68, 55, 42)
 _COLOURS: Final = 48
 _LEAST_SIDE_PX: Final = 16
-
-
-@functools.cache
-def pillow() -> Any:
-    """Return Pillow's module ``Image``."""
-    with optional_import():
-        from PIL import Image
-
-    return Image
 
 
 def encode_image(
@@ -106,15 +99,14 @@ def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES, *, has
 
 def _attempts(picture: Image.Image) -> Iterator[tuple[Image.Image, int]]:
     """Yield pictures of ever fewer bytes, with the quality of their JPEG."""
-    pil = pillow()
-    sharp = pil.Resampling.NEAREST if picture.mode in ("1", "P") else pil.Resampling.BOX
+    sharp = Image.Resampling.NEAREST if picture.mode in ("1", "P") else Image.Resampling.BOX
     if picture.mode in ("L", "RGB"):
         for quality in _QUALITIES:
             yield picture, quality
     small = picture
     while max(small.size) * 3 // 4 >= _LEAST_SIDE_PX:
         if picture.mode == "RGBA":
-            yield small.quantize(_COLOURS, pil.Quantize.FASTOCTREE), 0
+            yield small.quantize(_COLOURS, Image.Quantize.FASTOCTREE), 0
         small = picture.resize((max(1, small.width * 3 // 4), max(1, small.height * 3 // 4)), sharp)
         yield small, _QUALITIES[-1]
 
@@ -129,8 +121,6 @@ def _strided(image: Array, max_side_px: int | None) -> Array:
 
 def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
     """Return an image whose bytes 0 and 255 stand for the two ends; what lies outside of them is clipped."""
-    import numpy as np
-
     low, high = ends
     if image.dtype == np.uint8 and ends == (0.0, 255.0):
         return np.ascontiguousarray(image, dtype=np.uint8)
@@ -147,8 +137,7 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
 def _pillow(image: npt.NDArray[np.uint8], order: Order) -> Image.Image:
     mode = "L" if image.ndim == 2 else "RGB" if image.shape[2] == 3 else "RGBA"
     raw = "L" if mode == "L" else f"{order.upper()}{mode[3:]}"
-    picture: Image.Image = pillow().frombuffer(mode, image.shape[1::-1], image, "raw", raw, 0, 1)
-    return picture
+    return Image.frombuffer(mode, image.shape[1::-1], image, "raw", raw, 0, 1)
 
 
 def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
@@ -156,7 +145,7 @@ def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
         return picture
     scale = max_side_px / max(picture.size)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
-    return picture.resize(size, pillow().Resampling.BOX)
+    return picture.resize(size, Image.Resampling.BOX)
 
 
 def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bool = False) -> Picture:
@@ -183,7 +172,7 @@ def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     """Shrink to twice the size by maximum, and from there by mean: thin lines stay, and stay thinner than areas."""
     doubled = _mask_picture(mask, 2 * max_side_px).convert("L")
     indices = _resized(doubled, max_side_px).point(_BRIGHTER)
-    picture: Image.Image = pillow().frombytes("P", indices.size, indices.tobytes())
+    picture = Image.frombytes("P", indices.size, indices.tobytes())
     picture.putpalette([level * 255 // (_GREYS - 1) for level in range(_GREYS) for _ in "rgb"])
     return picture
 
@@ -194,14 +183,12 @@ def _is_thumbnail(image: Array, max_side_px: int | None) -> bool:
 
 
 def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
-    picture: Image.Image = pillow().fromarray(_mask_bits(mask, max_side_px))
+    picture = Image.fromarray(_mask_bits(mask, max_side_px))
     return picture.convert("1")
 
 
 def _mask_bits(mask: Array, max_side_px: int | None) -> npt.NDArray[np.bool_]:
     """Shrink by maximum: thin lines averaged over their black surroundings would vanish."""
-    import numpy as np
-
     bits = mask.view(np.uint8) if mask.dtype.kind == "b" else mask
     if max_side_px is not None and not is_pooled(mask):
         stride = max(1, max(mask.shape) // (_SAMPLED * max_side_px))
@@ -220,8 +207,6 @@ def is_pooled(mask: Array) -> bool:
 
 def _pooled(bits: Array, pool: int) -> Array:
     """Return each so many rows as one, with what is set in any of them."""
-    import numpy as np
-
     whole = bits.shape[0] // pool * pool
     pooled = np.bitwise_or.reduce(bits[:whole].reshape(-1, pool, bits.shape[1]), axis=1)
     rest = bits[whole:]
@@ -244,8 +229,6 @@ def bitmap_png(mask: Array) -> bytes:
     mask
         (height, width), bool or bytes; what is not 0 is white.
     """
-    import numpy as np
-
     height, width = mask.shape
     packed = np.packbits(mask, axis=1)
     rows = np.zeros((height, packed.shape[1] + 1), np.uint8)
@@ -283,11 +266,9 @@ def palette() -> bytes:
 
 def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
     """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
-    import numpy as np
-
     stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
     kept = labels[::stride, ::stride]
     numbers = np.where(kept > 0, (kept.astype(np.int64) - 1) % _LABEL_COLOURS + 1, np.where(kept < 0, _WHITE, 0))
-    picture: Image.Image = pillow().fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
+    picture = Image.fromarray(np.ascontiguousarray(numbers, dtype=np.uint8)).copy()
     picture.putpalette(palette())
     return picture

@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.display.previews.introspection import is_of
 from epypes.display.text import memory_text
+from epypes.optional import LazyModule
 from epypes.wording import counted
 
 if TYPE_CHECKING:
-    from epypes.display.previews.model import Array
+    import numpy as np
 
+    from epypes.display.previews import Array
+else:
+    np = LazyModule("numpy")
 
 Range = tuple[float, float]
 ImageKind = Literal["mask", "labels", "photograph"]
@@ -78,8 +82,6 @@ def is_mask(image: Array) -> bool:
 
 
 def _has_two_values(image: Array) -> bool:
-    import numpy as np
-
     # 0 and 255 are the two values that adding one, within a byte, brings to at most 1.
     is_white: bool = bool(((image.astype(np.uint8, copy=False) + np.uint8(1)) <= 1).all())
     return is_white or int(image.max(initial=0)) <= 1
@@ -87,8 +89,6 @@ def _has_two_values(image: Array) -> bool:
 
 def _is_labels(image: Array, sample: Array) -> bool:
     """Whether an image of whole numbers is constant by pieces, as those of regions are."""
-    import numpy as np
-
     if image.ndim != 2 or image.dtype.kind not in "iu" or not sample.size:
         return False
     least, largest = int(sample.min()), int(sample.max())
@@ -105,8 +105,6 @@ def _is_labels(image: Array, sample: Array) -> bool:
 
 def _has_pieces(image: Array, largest: int) -> bool:
     """Whether most neighbours are equal, of those that are not background."""
-    import numpy as np
-
     stride = math.ceil(math.sqrt(image.size / _PAIRS_PX))
     at, right, below = image[:-1:stride, :-1:stride], image[:-1:stride, 1::stride], image[1::stride, :-1:stride]
     # Pairs of neighbours: that touch an object, within objects, equal ones of these, and those that differ by one.
@@ -164,8 +162,6 @@ def is_of_dtype(dtype: Any, ends: Range) -> bool:
 
 def own_range(image: Array) -> Range | None:
     """Return the range of an image; None if it has no finite value or, of 16 bits, none but 0."""
-    import numpy as np
-
     if image.dtype.kind == "b" or not image.size:
         return _UNIT
     if image.dtype.str[1:] == "u1":
@@ -223,8 +219,6 @@ def statistics_text(sample: Array, array: Array) -> str:
 
 
 def _numbers(sample: Array, array: Array) -> list[str]:
-    import numpy as np
-
     if not array.size:
         return ["empty"]
     if array.dtype.kind in "mM":
@@ -247,8 +241,6 @@ def _numbers(sample: Array, array: Array) -> list[str]:
 
 def _finite(values: Any) -> tuple[Any, list[str]]:
     """Return the finite values, and how many of the others there are."""
-    import numpy as np
-
     if values.dtype.kind != "f":
         return values, []
     is_finite = np.isfinite(values)
@@ -265,8 +257,6 @@ def _text(value: Any) -> str:
 
 def label_text(sample: Array) -> str:
     """Return how many labels there are besides 0."""
-    import numpy as np
-
     positive = sample[sample > 0]
     is_narrow = positive.size > 0 and int(positive.max()) <= 10 * sample.size
     count = int(np.count_nonzero(np.bincount(positive))) if is_narrow else len(np.unique(positive))

@@ -144,22 +144,14 @@ def fields_of(value: Any) -> dict[str, Any] | None:
         return dict(zip(names, items_in(value), strict=False)) if type(names) is tuple else None
     if declared(kind, "__repr__") is SimpleNamespace.__repr__:
         return dict(_ATTRIBUTES.__get__(value))
-    if not _is_written_by_fields(kind):
+    # Those that Python writes: a repr of the author's own may be to hide something. It is recognized as pprint does it.
+    made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
+    if type(declared(kind, "__dataclass_fields__")) is not dict or type(made) is not FunctionType:
+        return None
+    if "__create_fn__" not in made.__qualname__:
         return None
     fields = ((field.name, stored(value, field.name)) for field in dataclasses.fields(kind) if field.repr)
     return {name: found[0] for name, found in fields if found}
-
-
-def _is_written_by_fields(kind: type) -> bool:
-    """Whether a class has the repr that ``dataclass`` makes: one of its author's own may be to hide something."""
-    if type(declared(kind, "__dataclass_fields__")) is not dict:
-        return False
-    # The function that dataclass makes is recognized as pprint does it.
-    made = getattr(declared(kind, "__repr__"), "__wrapped__", None)
-    return type(made) is FunctionType and "__create_fn__" in made.__qualname__
-
-
-_is_in_preview: Final = ContextVar("_is_in_preview", default=False)
 
 
 def silent_numpy() -> AbstractContextManager[Any]:
@@ -168,20 +160,17 @@ def silent_numpy() -> AbstractContextManager[Any]:
     return nullcontext() if numpy is None else numpy.errstate(all="ignore")
 
 
-@contextmanager
-def preview_context() -> Iterator[bool]:
-    """Look at a value: numpy keeps silent about numbers that overflow.
+_is_in_users_code: Final = ContextVar("_is_in_users_code", default=False)
+# Whether a preview function or a repr of a user's runs meanwhile. One that shows the run that its own value is in would
+# never come to an end: values are named only.
+is_in_users_code: Final = _is_in_users_code.get
 
-    Yields
-    ------
-    bool
-        Whether another value is being looked at meanwhile, since a function or repr of a user's shows a picture. One
-        that shows the run that its own value is in would never come to an end.
-    """
-    is_nested = _is_in_preview.get()
-    token = _is_in_preview.set(True)
+
+@contextmanager
+def users_code() -> Iterator[None]:
+    """Call what a user has written of a value."""
+    token = _is_in_users_code.set(True)
     try:
-        with silent_numpy():
-            yield is_nested
+        yield
     finally:
-        _is_in_preview.reset(token)
+        _is_in_users_code.reset(token)

@@ -9,12 +9,10 @@ import os
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from epypes.display.previews.drawing import bar_chart
-from epypes.display.previews.features import list_sketch
+from epypes.display.previews import Look, Preview, Sketch
+from epypes.display.previews.drawing import bar_chart, list_sketch
 from epypes.display.previews.images import some_of, statistics_text
 from epypes.display.previews.introspection import fields_of, is_of, items_in, kind_name, length_of, pairs_in, stored
-from epypes.display.previews.model import Look, Preview, Sketch
-from epypes.display.previews.registry import built_in
 from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items
 from epypes.display.text import cut, memory_text
 from epypes.nothing import NothingType
@@ -26,57 +24,57 @@ _PLAIN_TUPLE: Final = 4
 _NUMBERS: Final = (int, float, bool)
 
 
-@built_in(int, str, bytes, bytearray, complex, type(None))
-def _plain(value: Any, look: Look) -> Preview:
+def plain_preview(value: Any, look: Look) -> Preview:
+    """Look at a number, a text, bytes or None."""
     if issubclass(type(type(value)), enum.EnumType):
-        return _enum(value, look)
+        return enum_preview(value, look)
     short = short_repr(value)
     count = length_of(value)
     size = f" of {count}" if count > len(short) else ""
     return Preview(short, f"{_name(value)}{size} {short}")
 
 
-@built_in(NothingType)
-def _nothing(value: NothingType, look: Look) -> Preview:
+def nothing_preview(value: NothingType, look: Look) -> Preview:
+    """Look at what functions never receive."""
     return Preview("nothing found", "Nothing")
 
 
-@built_in(float)
-def _float(value: float, look: Look) -> Preview:
+def float_preview(value: float, look: Look) -> Preview:
+    """Look at a float."""
     if issubclass(type(type(value)), enum.EnumType) or not math.isfinite(value):
-        return _plain(value, look)
+        return plain_preview(value, look)
     return Preview(float_text(value), f"{_name(value)} {float.__repr__(value)}")
 
 
-@built_in(enum.Enum)
-def _enum(value: Any, look: Look) -> Preview:
+def enum_preview(value: Any, look: Look) -> Preview:
+    """Look at a member of an enumeration."""
     (name,), (content,) = stored(value, "_name_"), stored(value, "_value_")
     text = f"{_name(value)}.{name}"
     return Preview(text, f"{text} = {short_repr(content)}")
 
 
-@built_in(BaseException)
-def _exception(value: BaseException, look: Look) -> Preview:
+def exception_preview(value: BaseException, look: Look) -> Preview:
+    """Look at an exception."""
     return Preview(reason(value), reason(value, 200))
 
 
-@built_in("pathlib.PurePath", "pathlib._local.PurePath")
-def _path(value: Any, look: Look) -> Preview:
+def path_preview(value: Any, look: Look) -> Preview:
+    """Look at a path."""
     text = os.fspath(value)
     return Preview(value.name or text, f"{_name(value)} {cut(text, 200)}")
 
 
-@built_in(list)
-def _list(value: Sequence[Any], look: Look) -> Sketch | Preview:
+def list_preview(value: Sequence[Any], look: Look) -> Sketch | Preview:
+    """Look at a list: keypoints, matches, contours, a table of dicts, or any items."""
     # A subclass may have ways of its own to reach its items, which are not used.
     plain = value if type(value) is list else list(items_in(value))
     if is_dict_list(plain):
         return dict_list_sketch(plain)
-    return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
+    return list_sketch(plain, _name(value), look, lambda: items_preview(value, look)) or items_preview(value, look)
 
 
-@built_in(tuple)
-def _tuple(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
+def tuple_preview(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
+    """Look at a tuple: a histogram, named fields, what a list may be, or any items."""
     plain = value if type(value) is tuple else tuple(items_in(value))
     if is_histogram(plain):
         return histogram_sketch((plain[0], plain[1]))
@@ -85,24 +83,19 @@ def _tuple(value: tuple[Any, ...], look: Look) -> Sketch | Preview:
         return _fields(value, fields)
     if 0 < len(plain) <= _PLAIN_TUPLE and all(type(item) in _NUMBERS for item in plain):
         return Preview(short_repr(plain), f"tuple {short_repr(plain)}")
-    return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
+    return list_sketch(plain, _name(value), look, lambda: items_preview(value, look)) or items_preview(value, look)
 
 
-@built_in(set, frozenset)
-def _set(value: Any, look: Look) -> Preview:
-    return _items(value)
-
-
-@built_in(dict, "types.MappingProxyType", "builtins.mappingproxy")
-def _dict(value: Any, look: Look) -> Preview:
+def dict_preview(value: Any, look: Look) -> Preview:
+    """Look at a mapping."""
     count = length_of(value) or len(value)
     rows = row_texts(_item_rows(value), count, _MOST_ROWS) or ("(empty)",)
     keys = ", ".join(short_repr(key) for key, _ in itertools.islice(pairs_in(value), 8))
     return Preview(f"{_name(value)} of {count}", cut(f"{_name(value)} of {count}: {keys}", 200), rows=rows)
 
 
-@built_in(object)
-def _object(value: Any, look: Look) -> Preview:
+def object_preview(value: Any, look: Look) -> Preview:
+    """Look at any other object."""
     fields = fields_of(value)
     if fields is not None:
         return _fields(value, fields)
@@ -116,7 +109,8 @@ def _fields(value: Any, fields: dict[str, Any]) -> Preview:
     return Preview(text, cut(f"{text}: {detail}", 280), rows=row_texts(_item_rows(fields), len(fields), _MOST_ROWS))
 
 
-def _items(value: Any) -> Preview:
+def items_preview(value: Any, look: Look) -> Preview:
+    """Look at a list, a tuple or a set by its items."""
     count = length_of(value)
     text, rows = f"{_name(value)} of {count}", row_texts(map(short_repr, shown_items(value)), count, _MOST_ROWS)
     return Preview(text, f"{text}: {short_repr(value)}", rows=rows or ("(empty)",))
@@ -155,9 +149,8 @@ _ROWS: Final = 3
 _ROW_CHARACTERS: Final = 60
 
 
-# pandas 3 says where a class is imported from, earlier ones where it is defined.
-@built_in("pandas.DataFrame", "pandas.core.frame.DataFrame")
-def _frame(frame: Any, look: Look) -> Preview:
+def frame_preview(frame: Any, look: Look) -> Preview:
+    """Look at a table of pandas."""
     names = [_label(name) for name in itertools.islice(frame.columns, _NAMED)]
     kinds = [str(kind) for kind in itertools.islice(frame.dtypes, _NAMED)]
     columns = ", ".join(f"{cut(name, 20)} {kind}" for name, kind in zip(names, kinds, strict=True))
@@ -165,13 +158,12 @@ def _frame(frame: Any, look: Look) -> Preview:
     return _table(len(frame), frame.shape[1], names, list(rows), f"DataFrame: {columns}")
 
 
-@built_in("pandas.Series", "pandas.core.series.Series")
-def _series(series: Any, look: Look) -> Preview:
-    rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
+def series_preview(series: Any, look: Look) -> Preview:
+    """Look at a column of pandas."""
+    rows = (f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_MOST_ROWS].items())
     name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
-    more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
     detail = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
-    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=(*rows, *more))
+    return Preview(f"Series, {counted(len(series), 'row')}", detail, rows=row_texts(rows, len(series), _MOST_ROWS))
 
 
 def record_sketch(array: Any) -> Preview:

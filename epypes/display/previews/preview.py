@@ -1,24 +1,57 @@
-"""The preview of one value: a line of text, and a thumbnail if it can be drawn."""
+"""The preview of one value: a line of text, and a thumbnail if it can be drawn.
+
+Which function looks at a value is decided by its type: that of the first class in its method resolution order that has
+one; of two for one class, the user's. Classes of packages are named, so that they are known without being imported.
+"""
 
 from __future__ import annotations
 
+import enum
 import io
 import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final
+from pathlib import PurePath
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
+from weakref import WeakKeyDictionary
 
-from epypes.display.previews import arrays, objects
+from epypes.display.previews import (
+    THUMBNAIL_BYTES,
+    THUMBNAIL_PX,
+    Chart,
+    Look,
+    Picture,
+    Preview,
+    Scene,
+    Sketch,
+    arrays,
+    objects,
+)
 from epypes.display.previews.drawing import MOST_LINES, MOST_POINTS
-from epypes.display.previews.encoding import encode_small, pillow
+from epypes.display.previews.encoding import encode_small
 from epypes.display.previews.images import is_image
-from epypes.display.previews.introspection import kind_name, plain_text, preview_context
-from epypes.display.previews.model import THUMBNAIL_BYTES, THUMBNAIL_PX, Chart, Look, Picture, Preview, Scene, Sketch
-from epypes.display.previews.registry import preview_function_of
+from epypes.display.previews.introspection import (
+    dotted_name,
+    is_in_users_code,
+    kind_name,
+    parents,
+    plain_text,
+    silent_numpy,
+    users_code,
+)
 from epypes.display.previews.short import reason
 from epypes.display.text import cut
 from epypes.images import Order
+from epypes.nothing import NothingType
+from epypes.optional import LazyModule
+from epypes.run.guard import lend_to_reader
+
+if TYPE_CHECKING:
+    from PIL import Image
+else:
+    Image = LazyModule("PIL.Image")
 
 _TEXT_CHARACTERS: Final = 30
 _DETAIL_CHARACTERS: Final = 290
@@ -28,8 +61,119 @@ _CHARTS: Final = ("line", "bars", "points")
 # To decode more takes longer than a thumbnail may.
 _MOST_PIXELS: Final = 25_000_000
 
-# Each of these modules registers the kinds that it knows.
-_KINDS: Final = (arrays, objects)
+# -- which function looks at a type --------------------------------------------------------------------------------
+
+_Function = TypeVar("_Function", bound=Callable[[Any], Any])
+# What a preview function may return is checked where it is called.
+PreviewFunction = Callable[[Any, Look], Any]
+
+_BUILT_IN: Final[dict[type | str, PreviewFunction]] = {
+    **dict.fromkeys((int, str, bytes, bytearray, complex, type(None)), objects.plain_preview),
+    float: objects.float_preview,
+    NothingType: objects.nothing_preview,
+    enum.Enum: objects.enum_preview,
+    BaseException: objects.exception_preview,
+    PurePath: objects.path_preview,
+    list: objects.list_preview,
+    tuple: objects.tuple_preview,
+    **dict.fromkeys((set, frozenset), objects.items_preview),
+    **dict.fromkeys((dict, MappingProxyType), objects.dict_preview),
+    object: objects.object_preview,
+    "numpy.generic": arrays.number_preview,
+    "numpy.ndarray": arrays.array_sketch,
+    # pandas 3 says where a class is imported from, earlier ones where it is defined.
+    **dict.fromkeys(("pandas.DataFrame", "pandas.core.frame.DataFrame"), objects.frame_preview),
+    **dict.fromkeys(("pandas.Series", "pandas.core.series.Series"), objects.series_preview),
+}
+
+
+class _UsersFunctions:
+    """The functions that users have registered, by class and by a class's dotted name."""
+
+    def __init__(self) -> None:
+        # Weak, so that a class of a notebook that was defined again can go.
+        self.by_class: WeakKeyDictionary[type, PreviewFunction] = WeakKeyDictionary()
+        self.by_name: dict[str, PreviewFunction] = {}
+        # How often one was registered.
+        self.revision = 0
+
+    def get(self, kind: type) -> PreviewFunction | None:
+        """Return the function of this very class."""
+        return self.by_class.get(kind) or (self.by_name.get(dotted_name(kind)) if self.by_name else None)
+
+
+users_functions: Final = _UsersFunctions()
+
+
+def _function_of(kind: type) -> PreviewFunction:
+    for parent in parents(kind):
+        found = users_functions.get(parent) or _BUILT_IN.get(parent) or _BUILT_IN.get(dotted_name(parent))
+        if found is not None:
+            return found
+    raise TypeError(f"nothing is registered for {kind_name(kind)}")
+
+
+def is_shown_by_user(kind: type) -> bool:
+    """Whether a user's function looks at values of a class, or of one of its parents."""
+    return any(map(users_functions.get, parents(kind)))
+
+
+@overload
+def register_preview(kind: type | str, function: None = None) -> Callable[[_Function], _Function]: ...
+@overload
+def register_preview(kind: type | str, function: _Function) -> _Function: ...
+def register_preview(kind: type | str, function: Callable[[Any], Any] | None = None) -> Any:
+    """Register how values of a type are shown in pictures of graphs and runs.
+
+    Parameters
+    ----------
+    kind
+        The class, whose subclasses are then shown so too, or its dotted name, ``"package.module.Pose"``, which
+        imports nothing.
+    function
+        Takes a value, arrays read-only, and returns a short text, an image (an array as OpenCV has it), or a
+        ``Preview``. It runs whenever a picture of a graph or run with such a value is made, so it should be quick and
+        change nothing. If it raises, the reason is shown in place; what it shows itself meanwhile has no previews.
+
+    Returns
+    -------
+    callable
+        The function; without one, a decorator.
+
+    Raises
+    ------
+    TypeError
+        The kind is neither class nor name, or the function can't be called.
+
+    Examples
+    --------
+    >>> class Pose:
+    ...     x = 3
+    >>> @register_preview(Pose)
+    ... def show_pose(pose):
+    ...     return f"x = {pose.x}"
+    """
+    if not isinstance(kind, type) and not (isinstance(kind, str) and "." in kind):
+        raise TypeError(f"A preview is registered for a class or its dotted name, 'module.Class', not {kind!r}.")
+    if function is None:
+        return lambda given: register_preview(kind, given)
+    if not callable(function):
+        raise TypeError(f"The preview of {kind!r} must be a function that takes the value, not {function!r:.60}.")
+
+    def by_user(value: Any, look: Look) -> Any:
+        with users_code():
+            # As for the functions of a graph: what is shown can't be spoilt.
+            return function(lend_to_reader(value))
+
+    users_functions.revision += 1
+    if isinstance(kind, type):
+        users_functions.by_class[kind] = by_user
+    else:
+        users_functions.by_name[kind] = by_user
+    return function
+
+
+# -- a value -------------------------------------------------------------------------------------------------------
 
 
 def preview(value: Any, order: Order = "bgr") -> Preview:
@@ -38,60 +182,50 @@ def preview(value: Any, order: Order = "bgr") -> Preview:
 
 
 def sketch(value: Any, look: Look) -> Sketch:
-    """Look at a value without making its thumbnail; never raises. What is looked at meanwhile is but named."""
-    with preview_context() as is_nested:
-        return sketch_in_context(value, look, is_nested)
-
-
-def sketch_in_context(value: Any, look: Look, is_nested: bool) -> Sketch:
-    """Look at a value like ``sketch``, where several are looked at within one ``preview_context()``."""
-    if is_nested:
+    """Look at a value without making its thumbnail; never raises."""
+    if is_in_users_code():
         return Sketch(Preview(_kind(value), _kind(value)))
     try:
-        return _checked(preview_function_of(type(value))(value, look), value, look)
+        with silent_numpy():
+            return _checked(_function_of(type(value))(value, look), value, look)
     except Exception as error:
         return Sketch(_failed(Preview("", _kind(value)), "no preview", error))
 
 
 def looked_closer(sketched: Sketch) -> Sketch:
     """Return what is shown once there is room for a thumbnail, which is not made yet. Never raises."""
-    with preview_context():
-        return _closer(sketched)
-
-
-def _closer(sketched: Sketch) -> Sketch:
+    if sketched.closer is None:
+        return sketched
     try:
-        return sketched if sketched.closer is None else _limited(sketched.closer())
+        with silent_numpy():
+            return _limited(sketched.closer())
     except Exception as error:
         return Sketch(_failed(sketched.shown, "no picture", error))
 
 
 def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
     """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
-    with preview_context():
-        return finished_in_context(sketched, most_bytes)
-
-
-def finished_in_context(sketched: Sketch, most_bytes: int) -> Preview:
-    """Return a preview like ``finished``, where several are made within one ``preview_context()``."""
-    sketched = _closer(sketched)
+    sketched = looked_closer(sketched)
+    if sketched.draw is None:
+        return sketched.shown
     try:
-        drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
+        with silent_numpy():
+            drawn = sketched.draw(most_bytes)
     except Exception as error:
         return _failed(sketched.shown, "no picture", error)
     if isinstance(drawn, Chart):
         return replace(sketched.shown, chart=drawn)
-    return sketched.shown if drawn is None else replace(sketched.shown, picture=drawn)
+    return replace(sketched.shown, picture=drawn)
 
 
 def scene_in(sketched: Sketch) -> Scene | None:
     """Return the image of a sketch and what is drawn over it; None if it has none. Never raises."""
-    with preview_context():
-        try:
-            found = sketched if sketched.closer is None else sketched.closer()
-            return found.scene() if isinstance(found, Sketch) and found.scene is not None else None
-        except Exception:  # the reason stands where the value is shown as text
-            return None
+    scene = looked_closer(sketched).scene
+    try:
+        with silent_numpy():
+            return None if scene is None else scene()
+    except Exception:  # the reason stands where the value is shown as text
+        return None
 
 
 def _limited(found: Sketch | Preview) -> Sketch:
@@ -140,12 +274,10 @@ def _trimmed(shown: Preview) -> Preview:
         if not issubclass(type(line), str):
             raise TypeError("text, detail and rows of a preview must be texts")
     text = cut(plain_text(shown.text)[:500], _TEXT_CHARACTERS)
+    short = [plain_text(row)[:_ROW_CHARACTERS] for row in rows]
+    lines = ["".join(mark if mark.isprintable() else " " for mark in row) for row in short]
     detail = cut(plain_text(shown.detail)[:1000], _DETAIL_CHARACTERS)
-    return Preview(text or "(empty text)", detail, shown.picture, shown.chart, tuple(map(_on_one_line, rows)))
-
-
-def _on_one_line(row: str) -> str:
-    return "".join(mark if mark.isprintable() else " " for mark in plain_text(row)[:_ROW_CHARACTERS])
+    return Preview(text or "(empty text)", detail, shown.picture, shown.chart, tuple(lines))
 
 
 def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | None:
@@ -175,7 +307,7 @@ def _checked_chart(chart: Any) -> Chart:
 
 def _checked_picture(picture: Picture, most_bytes: int) -> Picture:
     """Return a picture within the limits of a thumbnail; what it is, its bytes decide."""
-    with pillow().open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
+    with Image.open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
         if opened.width * opened.height > _MOST_PIXELS:
             raise ValueError(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
         # What is broken is found by decoding it.

@@ -24,6 +24,7 @@ from epypes.display.previews.introspection import (
     plain_text,
     qualified_name,
     sorted_items,
+    users_code,
 )
 from epypes.display.text import cut
 
@@ -124,7 +125,8 @@ def shown_items(value: Any) -> Iterator[Any]:
 
 def _text_by(write: Callable[[Any], str], value: Any) -> str:
     """Return an author's ``repr`` or ``str`` of a value, without addresses in memory."""
-    return without_addresses(plain_text(write(value))[: 2 * _LONGEST])
+    with users_code():
+        return without_addresses(plain_text(write(value))[: 2 * _LONGEST])
 
 
 def without_addresses(text: str) -> str:

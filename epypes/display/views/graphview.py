@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import base64
-import functools
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Final, Literal, NamedTuple
 
-from epypes.display.layout.geometry import Direction as Direction
-from epypes.display.previews.model import Picture, Preview
+from epypes.display.layout import Direction as Direction
+from epypes.display.previews import Chart, Picture, Preview
 from epypes.images import Order
 
 # For each vertex.
@@ -191,7 +188,7 @@ def from_json(written: Mapping[str, Any]) -> GraphView:
     """
     if not isinstance(written, Mapping):
         raise TypeError(f"A view in JSON is an object, not {type(written).__name__!r}.")
-    graph: GraphView = _read(GraphView, written)
+    graph: GraphView = _read(written, GraphView)
     return graph
 
 
@@ -206,34 +203,30 @@ def _written(value: Any) -> Any:
     return [_written(item) for item in value] if isinstance(value, tuple) else value
 
 
-def _read(kind: Any, written: Any) -> Any:
-    """Return a value of a kind, as an annotation of a record says it."""
-    if Picture in _parts(kind) and isinstance(written, Mapping):
+# The fields that have records, one or several; those of all others have texts, numbers and tuples of them.
+_RECORDS: Final[dict[str, type]] = {
+    "functions": FunctionView,
+    "tokens": TokenView,
+    "edges": EdgeView,
+    "before": StageView,
+    "after": StageView,
+    "groups": GroupView,
+    "graph": GraphView,
+    "preview": Preview,
+    "picture": Picture,
+    "chart": Chart,
+}
+
+
+def _read(written: Any, record: type | None) -> Any:
+    if isinstance(written, list):
+        return tuple(_read(item, record) for item in written)
+    if record is None or written is None:
+        return written
+    if not isinstance(written, Mapping):
+        raise TypeError(f"A {record.__name__} in JSON is an object, not {type(written).__name__!r}.")
+    if record is Picture:
         media_type, _, data = written["uri"].removeprefix("data:").partition(";base64,")
         return Picture(base64.b64decode(data), media_type, written["width"], written["height"])
-    if isinstance(written, Mapping):
-        (record,) = (part for part in _parts(kind) if hasattr(part, "__annotations__"))
-        kinds = _kinds(record)
-        return record(**{name: _read(kinds[name], item) for name, item in written.items() if name in kinds})
-    if isinstance(written, list):
-        return tuple(
-            _read(item_kind, item) for item_kind, item in zip(_item_kinds(kind, len(written)), written, strict=True)
-        )
-    return written
-
-
-@functools.cache
-def _kinds(record: type) -> dict[str, Any]:
-    return typing.get_type_hints(record)
-
-
-def _parts(kind: Any) -> tuple[Any, ...]:
-    """Return the kinds of which a value may be one."""
-    return typing.get_args(kind) if typing.get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
-
-
-def _item_kinds(kind: Any, count: int) -> tuple[Any, ...]:
-    """Return the kind of each item of a tuple."""
-    (of,) = (part for part in _parts(kind) if typing.get_origin(part) is tuple)
-    items = typing.get_args(of)
-    return items[:1] * count if items[-1] is Ellipsis else items
+    known = record.__annotations__
+    return record(**{name: _read(item, _RECORDS.get(name)) for name, item in written.items() if name in known})

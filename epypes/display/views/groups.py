@@ -65,14 +65,11 @@ def twice_seen(cg: CompGraph, groups: Mapping[str, Sequence[str]]) -> int:
     for functions in groups.values():
         names = frozenset(functions)
         tokens = {token for name in names for token in (*cg.func_inputs(name), *cg.func_outputs(name))}
-        count += 1 + sum(not _is_within(cg, token, names) for token in tokens)
+        count += 1
+        for token in tokens:
+            takers, maker = cg.digraph.consumers.get(token, ()), cg.digraph.producer.get(token)
+            count += not (takers and names.issuperset(takers) and (maker is None or maker in names))
     return count
-
-
-def _is_within(cg: CompGraph, token: str, functions: frozenset[str]) -> bool:
-    """Whether a token is taken, and taken and made by these functions only."""
-    takers, maker = cg.digraph.consumers.get(token, ()), cg.digraph.producer.get(token)
-    return bool(takers) and functions.issuperset(takers) and (maker is None or maker in functions)
 
 
 def collapsed(graph: GraphView, groups: Mapping[str, Sequence[str]]) -> GraphView:
@@ -192,21 +189,19 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
     edges = [edge for edge in graph.edges if edge.function in new_function]
     new_token = {token: new for new, token in enumerate(sorted({edge.token for edge in edges}))}
     names = {graph.tokens[token].name for token in new_token}
+    tokens = []
+    for place in new_token:
+        token = graph.tokens[place]
+        if place not in hidden and token.preview is not None:
+            token = token._replace(preview=replace(token.preview, picture=None, chart=None, rows=()))
+        tokens.append(token)
     return GraphView(
         tuple(graph.functions[place] for place in places),
-        tuple(
-            graph.tokens[token] if token in hidden else _without_thumbnail(graph.tokens[token]) for token in new_token
-        ),
+        tuple(tokens),
         tuple(edge._replace(function=new_function[edge.function], token=new_token[edge.token]) for edge in edges),
         direction=graph.direction,
         delays=tuple(pair for pair in graph.delays if names.issuperset(pair)),
     )
-
-
-def _without_thumbnail(token: TokenView) -> TokenView:
-    if token.preview is None:
-        return token
-    return token._replace(preview=replace(token.preview, picture=None, chart=None, rows=()))
 
 
 def function_count(graph: GraphView) -> int:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from types import CodeType, FunctionType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews.preview import preview
 from epypes.display.previews.short import without_addresses
-from epypes.display.text import cut
+from epypes.display.text import cut, listed, shortened
 from epypes.display.views.graphview import (
     EdgeView,
     FunctionState,
@@ -44,14 +44,6 @@ _NAMED: Final = 3
 _kept: WeakKeyDictionary[CompGraph, tuple[tuple[Any, ...], GraphView]] = WeakKeyDictionary()
 
 
-class _Choices(NamedTuple):
-    """What runs depend on: by switch the key of the chosen branch, and which functions are not needed or redefined."""
-
-    branches: Mapping[str, Any]
-    left_out: Collection[str]
-    redefined: Mapping[str, bool]
-
-
 def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str]) -> GraphView:
     """Look at a graph.
 
@@ -67,91 +59,85 @@ def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collectio
     key = tuple(old.items()), tuple(branches.items()), tuple(left_out)
     kept = _kept.get(cg)
     if kept is None or kept[0] != key:
-        kept = _kept[cg] = key, _structure(cg, _Choices(branches, left_out, old))
+        kept = _kept[cg] = key, _Structure(cg, branches, left_out, old).view()
     return kept[1]
 
 
-def _structure(cg: CompGraph, choices: _Choices) -> GraphView:
-    unread = {name: _unread(cg, name, choices.branches) for name in cg.switches}
-    return GraphView(
-        tuple(_function_view(cg, name, choices) for name in cg.functions),
-        tuple(_token_view(cg, token, choices, unread) for token in cg.tokens),
-        tuple(_edges(cg, choices.left_out, unread)),
-        _redefined_caption(choices.redefined),
-        delays=tuple((delay.token, previous) for previous, delay in cg.delays.items()),
-    )
+class _Structure:
+    """A graph with what runs depend on: the chosen branches, and which functions are not needed or redefined."""
 
+    def __init__(
+        self, cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str], old: Mapping[str, bool]
+    ) -> None:
+        self._cg, self._branches, self._left_out, self._old = cg, branches, left_out, old
+        # By switch, the tokens of the branches that it does not read: all as long as it has not chosen.
+        self._unread: dict[str, frozenset[str]] = {}
+        for name in cg.switches:
+            selector, *tokens = cg.func_inputs(name)
+            function, read = as_switch(cg.functions[name]), {selector}
+            if function is not None and name in branches:
+                read.add(tokens[function.branch_index(branches[name])])
+            self._unread[name] = frozenset(tokens) - read
 
-def _unread(cg: CompGraph, name: str, branches: Mapping[str, Any]) -> frozenset[str]:
-    """Return the tokens of the branches that a switch does not read: all as long as it has not chosen."""
-    selector, *tokens = cg.func_inputs(name)
-    read = {selector}
-    function = as_switch(cg.functions[name])
-    if function is not None and name in branches:
-        read.add(tokens[function.branch_index(branches[name])])
-    return frozenset(tokens) - read
+    def view(self) -> GraphView:
+        delays = tuple((delay.token, previous) for previous, delay in self._cg.delays.items())
+        functions, tokens = map(self._function, self._cg.functions), map(self._token, self._cg.tokens)
+        return GraphView(tuple(functions), tuple(tokens), tuple(self._edges()), self._caption(), delays=delays)
 
+    def _function(self, name: str) -> FunctionView:
+        state: FunctionState = "left out" if name in self._left_out else "static"
+        function, old = self._cg.functions[name], name in self._old
+        switch, inner = as_switch(function), inner_graph(function)
+        if switch is not None:
+            return FunctionView(name, state, kind="switch", notes=(self._choice(name, switch),))
+        if name in self._cg.placeholders:
+            return FunctionView(name, state, kind="placeholder", notes=(_TO_BE_WRITTEN,))
+        notes = ((_REDEFINED_INSIDE if self._old[name] else _REDEFINED),) if old else ()
+        if inner is None:
+            signature, source = signature_and_source(function)
+            return FunctionView(name, state, notes=notes, is_redefined=old, signature=signature, source=source)
+        notes = (f"pipeline of {counted(len(inner.functions), 'function')}", *notes)
+        return FunctionView(name, state, kind="pipeline", notes=notes, is_redefined=old, source=_graph_lines(inner))
 
-def _function_view(cg: CompGraph, name: str, choices: _Choices) -> FunctionView:
-    state: FunctionState = "left out" if name in choices.left_out else "static"
-    function = cg.functions[name]
-    switch, inner = as_switch(function), inner_graph(function)
-    if switch is not None:
-        return FunctionView(name, state, kind="switch", notes=(_choice(cg, name, switch, choices.branches),))
-    if name in cg.placeholders:
-        return FunctionView(name, state, kind="placeholder", notes=(_TO_BE_WRITTEN,))
-    old = name in choices.redefined
-    notes = ((_REDEFINED_INSIDE if choices.redefined[name] else _REDEFINED),) if old else ()
-    if inner is None:
-        signature, source = signature_and_source(function)
-        return FunctionView(name, state, notes=notes, is_redefined=old, signature=signature, source=source)
-    notes = (f"pipeline of {counted(len(inner.functions), 'function')}", *notes)
-    return FunctionView(name, state, kind="pipeline", notes=notes, is_redefined=old, source=_graph_lines(inner))
+    def _choice(self, name: str, function: Switch) -> str:
+        selector = cut(self._cg.func_inputs(name)[0], _SELECTOR_CHARACTERS)
+        if name not in self._branches:
+            return f"one of {len(function.branches)} by {selector}"
+        key = self._branches[name]
+        return f"{selector} = {cut(key if isinstance(key, str) else preview(key).text, _KEY_CHARACTERS)}"
 
+    def _token(self, token: str) -> TokenView:
+        maker, takers = self._cg.digraph.producer.get(token), self._cg.digraph.consumers.get(token, ())
+        if maker is not None:
+            is_left_out = maker in self._left_out
+        else:
+            is_left_out = all(
+                name in self._left_out or (name in self._branches and token in self._unread[name]) for name in takers
+            )
+        state: TokenState = "left out" if is_left_out else "static"
+        colours, delay = self._cg.colours.get(token, ASSUMED), self._cg.delays.get(token)
+        delayed = delay.token if delay is not None else ""
+        return TokenView(token, "payload", state, order=colours.order, order_by=colours.function, delayed=delayed)
 
-def _choice(cg: CompGraph, name: str, function: Switch, branches: Mapping[str, Any]) -> str:
-    selector = cut(cg.func_inputs(name)[0], _SELECTOR_CHARACTERS)
-    if name not in branches:
-        return f"one of {len(function.branches)} by {selector}"
-    key = branches[name]
-    return f"{selector} = {cut(key if isinstance(key, str) else preview(key).text, _KEY_CHARACTERS)}"
+    def _edges(self) -> Iterator[EdgeView]:
+        place = {token: index for index, token in enumerate(self._cg.tokens)}
+        for index, name in enumerate(self._cg.functions):
+            is_needed, unread = name not in self._left_out, self._unread.get(name, frozenset())
+            for token in dict.fromkeys(self._cg.func_inputs(name)):
+                yield EdgeView(index, place[token], True, is_needed and token not in unread)
+            for token in dict.fromkeys(self._cg.func_outputs(name)):
+                yield EdgeView(index, place[token], False, is_needed)
 
-
-def _token_view(cg: CompGraph, token: str, choices: _Choices, unread: Mapping[str, frozenset[str]]) -> TokenView:
-    branches, left_out, maker = choices.branches, choices.left_out, cg.digraph.producer.get(token)
-    if maker is not None:
-        is_left_out = maker in left_out
-    else:
-        consumers = cg.digraph.consumers[token]
-        is_left_out = all(name in left_out or (name in branches and token in unread[name]) for name in consumers)
-    found = cg.colours.get(token, ASSUMED)
-    delayed = cg.delays[token].token if token in cg.delays else ""
-    state: TokenState = "left out" if is_left_out else "static"
-    return TokenView(token, "payload", state, order=found.order, order_by=found.function, delayed=delayed)
-
-
-def _edges(cg: CompGraph, left_out: Collection[str], unread: Mapping[str, frozenset[str]]) -> Iterator[EdgeView]:
-    place = {token: index for index, token in enumerate(cg.tokens)}
-    for index, name in enumerate(cg.functions):
-        is_needed, closed = name not in left_out, unread.get(name, frozenset())
-        for token in dict.fromkeys(cg.func_inputs(name)):
-            yield EdgeView(index, place[token], True, is_needed and token not in closed)
-        for token in dict.fromkeys(cg.func_outputs(name)):
-            yield EdgeView(index, place[token], False, is_needed)
-
-
-def _redefined_caption(redefined: Mapping[str, bool]) -> str:
-    if not redefined:
-        return ""
-    names = [
-        f"{'a function inside ' * is_inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
-        for name, is_inside in redefined.items()
-    ]
-    some = ", ".join(names[:_NAMED])
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    verb = "was" if len(names) == 1 else "were"
-    start = some[0].upper() + some[1:]
-    return f"{start}{more} {verb} redefined since the graph was built: run the cell that builds it again"
+    def _caption(self) -> str:
+        if not self._old:
+            return ""
+        names = [
+            f"{'a function inside ' * is_inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
+            for name, is_inside in self._old.items()
+        ]
+        some, verb = listed(names, _NAMED), "was" if len(names) == 1 else "were"
+        start = some[0].upper() + some[1:]
+        return f"{start} {verb} redefined since the graph was built: run the cell that builds it again"
 
 
 # -- signatures and sources ----------------------------------------------------------------------------------------
@@ -216,7 +202,7 @@ def _signature_text(function: Any) -> str:
     if len(text) > SIGNATURE_CHARACTERS:
         plain = [each.replace(annotation=each.empty) for each in short]
         text = without_addresses(str(signature.replace(parameters=plain, return_annotation=signature.empty)))
-    return _shortened(text, SIGNATURE_CHARACTERS)
+    return shortened(text, SIGNATURE_CHARACTERS)
 
 
 def _source(function: Any) -> str:
@@ -250,7 +236,7 @@ def _documentation(function: Any) -> str:
     if isinstance(function, FunctionType) or not callable(function):
         return ""
     lines = (inspect.getdoc(function) or "")[:10_000].splitlines()[: SOURCE_LINES - 1]
-    return "\n".join([_DOCUMENTED, *(_shortened(line.rstrip(), LINE_CHARACTERS) for line in lines)]) if lines else ""
+    return "\n".join([_DOCUMENTED, *(shortened(line.rstrip(), LINE_CHARACTERS) for line in lines)]) if lines else ""
 
 
 def _graph_lines(cg: CompGraph) -> str:
@@ -264,11 +250,7 @@ def _graph_lines(cg: CompGraph) -> str:
 def _first_lines(lines: Sequence[str]) -> str:
     kept = [line.rstrip().expandtabs(4) for line in lines[:SOURCE_LINES]]
     margin = min((len(line) - len(line.lstrip()) for line in kept if line), default=0)
-    short = [_shortened(line[margin:], LINE_CHARACTERS) for line in kept]
+    short = [shortened(line[margin:], LINE_CHARACTERS) for line in kept]
     if len(lines) > SOURCE_LINES:
         short[-1] = "…"
     return "\n".join(short)
-
-
-def _shortened(text: str, characters: int) -> str:
-    return text if len(text) <= characters else text[: characters - 1] + "…"

@@ -1,26 +1,78 @@
-"""The images of a run that what was found in them is drawn over, and scenes at full size.
+"""The images of a run that a token is seen with: its display range, what it is drawn over, scenes at full size.
 
-The graph shows them: a token is made from the tokens that its function takes, those from others, and so on.
+The graph shows which these are: a token is made from the tokens that its function takes, those from others, and so on.
+An image whose dtype does not define black and white has the range of the token's first one: if every frame had a range
+of its own, a change of brightness would not be seen.
 """
 
 from __future__ import annotations
 
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
-from typing import Any, Final
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakKeyDictionary
 
+from epypes.display.previews import Backdrop, Look, Most, Scene, Surroundings
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.features import are_keypoints
-from epypes.display.previews.images import Range, image_kind, is_image, sampled
-from epypes.display.previews.kept import kept_range
-from epypes.display.previews.model import Backdrop, Look, Marks, Most, Scene, Surroundings
+from epypes.display.previews.drawing import are_keypoints, no_marks
+from epypes.display.previews.images import Range, display_range, image_kind, is_image, own_range, sampled
+from epypes.display.previews.introspection import kind_name
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
-from epypes.run import Run
+from epypes.run import CompGraphRunner, Run
+from epypes.run.program import Program
+
+if TYPE_CHECKING:
+    from epypes.display.previews import Array
 
 _MOST_TOKENS: Final = 500
+
+# -- display ranges ------------------------------------------------------------------------------------------------
+
+# By program, token and dtype.
+_ranges: WeakKeyDictionary[Program, dict[tuple[str, str], Range]] = WeakKeyDictionary()
+_lock = threading.Lock()
+
+
+def _kept_range(program: Program, token: str, image: Array) -> Range:
+    """Return the values that are shown black and white in a token's images: what its first one had.
+
+    Of an image of one value nothing is kept, since it does not show what is to come.
+    """
+    if image.dtype.kind == "b" or image.dtype.str[1:] == "u1":
+        return display_range(image)
+    with _lock:
+        ranges = _ranges.setdefault(program, {})
+    key = token, image.dtype.str
+    if key in ranges:
+        return ranges[key]
+    found = own_range(image)
+    if found is None or found[0] >= found[1]:
+        return display_range(image)
+    return ranges.setdefault(key, found)
+
+
+def reset_display_ranges(shown: Any) -> None:
+    """Forget which values are shown black and white; those of the next images are kept instead.
+
+    Parameters
+    ----------
+    shown
+        A runner, a run or a pipeline; of all its tokens.
+    """
+    runner = getattr(shown, "runner", shown)
+    run = runner.last if isinstance(runner, CompGraphRunner) else runner
+    if isinstance(run, Run):
+        with _lock:
+            _ranges.pop(run.tokens.program, None)
+    elif not isinstance(runner, CompGraphRunner):
+        raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
+
+
+# -- what a token was made from ------------------------------------------------------------------------------------
 
 
 class RunSurroundings(Surroundings):
@@ -32,12 +84,18 @@ class RunSurroundings(Surroundings):
         Its values that are out of date are not looked at.
     token
         Which one is to be drawn over them.
-    range_of
-        Returns which values of a token's image are black and white; None: those that are kept of its first one.
+    keeps_ranges
+        Whether each token's images are shown in the display range of its first one, else each in its own.
     """
 
-    def __init__(self, run: Run, token: str, range_of: Callable[[str, Any], Range] | None = None) -> None:
-        self._run, self._token, self._range_of = run, token, range_of
+    def __init__(self, run: Run, token: str, *, keeps_ranges: bool = True) -> None:
+        self._run, self._token, self._keeps_ranges = run, token, keeps_ranges
+
+    def range_of(self, image: Any, token: str = "") -> Range:
+        """Return which values of a token's image are black and white; without one, of this token's."""
+        if not self._keeps_ranges:
+            return display_range(image)
+        return _kept_range(self._run.tokens.program, token or self._token, image)
 
     def nearest_image(self) -> Backdrop | None:
         """Return the nearest image among the token's ancestors; of its size rather a photograph than a mask."""
@@ -47,13 +105,10 @@ class RunSurroundings(Surroundings):
         """Return the images of the two nearest keypoint tokens; without such, the first image of two inputs."""
         keypoints = self._pair(self._token, self._is_keypoints, set())
         if keypoints is not None:
-            first, second = (self._image_of(token) for token in keypoints)
-        else:
-            images = self._pair(self._token, self._is_photograph, set())
-            if images is None:
-                return None
-            first, second = (self._backdrop(token) for token in images)
-        return (first, second) if first is not None and second is not None else None
+            first, second = map(self._image_of, keypoints)
+            return (first, second) if first is not None and second is not None else None
+        images = self._pair(self._token, self._is_photograph, set())
+        return None if images is None else (self._backdrop(images[0]), self._backdrop(images[1]))
 
     def keypoint_pair(self) -> tuple[Any, Any] | None:
         """Return the values of the two nearest keypoint tokens, one by each input in order."""
@@ -85,17 +140,12 @@ class RunSurroundings(Surroundings):
         return next(filter(None, (self._pair(name, is_wanted, seen) for name in inputs)), None)
 
     def _around(self, token: str) -> Iterator[str]:
-        """Yield a token, what its function made beside it, and their ancestors."""
-        yield token
-        maker = self._run.cg.digraph.producer.get(token)
-        if maker is not None:
-            yield from (name for name in self._run.cg.digraph.outputs[maker] if name != token and self._is_fresh(name))
-        for name in self._ancestors(token):
+        """Yield a token and its ancestors, each with what its function made beside it."""
+        for name in chain((token,), self._ancestors(token)):
             yield name
             maker = self._run.cg.digraph.producer.get(name)
-            yield from (
-                () if maker is None else (near for near in self._run.cg.digraph.outputs[maker] if self._is_fresh(near))
-            )
+            if maker is not None:
+                yield from filter(self._is_fresh, self._run.cg.digraph.outputs[maker])
 
     def _ancestors(self, token: str) -> Iterator[str]:
         """Yield the tokens that a token was made from that have a value, the nearest first."""
@@ -127,8 +177,7 @@ class RunSurroundings(Surroundings):
 
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
-        range_of = self._range_of or partial(kept_range, self._run.tokens.program)
-        return Backdrop(value, colour_order(self._run.cg, token), range_of(token, value), token)
+        return Backdrop(value, colour_order(self._run.cg, token), self.range_of(value, token), token)
 
 
 def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:
@@ -160,23 +209,15 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
     >>> scene.backdrop.name, scene.what, scene.marks.points.tolist()
     ('image', 'points', [[20.0, 10.0], [30.0, 10.0]])
     """
-    program, tokens = run.tokens.program, run.tokens
+    tokens, around = run.tokens, RunSurroundings(run, token)
     if not tokens.is_computed(token) or tokens.is_stale(token) or tokens.is_nothing(token):
         return None
-    value, order = tokens.values[program.slots[token]], colour_order(run.cg, token)
+    value, order = tokens.values[tokens.program.slots[token]], colour_order(run.cg, token)
     if is_image(value):
         array = plain_array(value)
-        return Scene(Backdrop(array, order, kept_range(program, token, array), token))
-    around = RunSurroundings(run, token)
-    look = Look(order, partial(kept_range, program, token), around, most or Most())
-    scene = scene_in(sketch(value, look))
+        return Scene(Backdrop(array, order, around.range_of(array), token))
+    scene = scene_in(sketch(value, Look(order, around, most or Most())))
     if scene is None:
-        return _without_marks(around) if had_marks else None
+        backdrop = around.nearest_image() if had_marks else None
+        return None if backdrop is None else Scene(backdrop, no_marks())
     return scene if scene.backdrop.name else replace(scene, backdrop=replace(scene.backdrop, name=token))
-
-
-def _without_marks(around: RunSurroundings) -> Scene | None:
-    import numpy as np
-
-    backdrop = around.nearest_image()
-    return None if backdrop is None else Scene(backdrop, Marks(np.empty((0, 2))))

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from weakref import WeakKeyDictionary, ref
 
-from epypes.display.previews.introspection import preview_context
-from epypes.display.previews.kept import ValuePreview, kept_previews, kept_range
-from epypes.display.previews.model import THUMBNAIL_BYTES, Look, Preview
+from epypes.display.previews import THUMBNAIL_BYTES, Look, Preview, Sketch
+from epypes.display.previews.images import Range
+from epypes.display.previews.introspection import is_in_users_code
+from epypes.display.previews.preview import finished, is_shown_by_user, sketch, users_functions
 from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.views.graphview import GraphView, TokenState, TokenView
 from epypes.display.views.surroundings import RunSurroundings
+from epypes.nothing import NothingType
+from epypes.optional import LazyModule
 from epypes.run import Run
+from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, is_same_value
 
 # What a picture of so few bytes shows is hardly seen; rather are some left out.
@@ -20,29 +24,104 @@ _LEAST_BYTES: Final = 1_500
 _ELEMENT_CHARACTERS: Final = 150
 _POINT_CHARACTERS: Final = 12
 
+if TYPE_CHECKING:
+    import numpy as np
+else:
+    np = LazyModule("numpy")
+
+
+_SCALARS: Final = frozenset({int, float, complex, bool, type(None), NothingType})
+_SHORT_TEXT: Final = 200
+
 Rank = Callable[[str], Any]
 
 
+class _TokenPreview:
+    """The preview of a token's value, and its thumbnail once that was made.
+
+    Attributes
+    ----------
+    brief
+        The preview without a thumbnail.
+    is_drawable
+        Whether it may get one.
+    is_image
+        Whether the value is an image.
+    sketch
+        Refers to the value's memory, so it is forgotten once a picture is painted.
+    is_constant
+        Whether the value can't be changed, and the preview is made of nothing else: such a preview may be kept. A
+        payload is not constant, since its owner may fill it again.
+    """
+
+    __slots__ = (
+        "_made",
+        "_range",
+        "_reference",
+        "_revision",
+        "brief",
+        "is_constant",
+        "is_drawable",
+        "is_image",
+        "sketch",
+    )
+
+    def __init__(self, value: Any, look: Look) -> None:
+        self.sketch: Sketch | None = (sketched := sketch(value, look))
+        self.brief, self.is_drawable, self.is_image = sketched.shown, sketched.may_be_drawn, sketched.is_image
+        self._made: tuple[Preview, int] | None = None
+        self._range: Range | None = None
+        self._reference: Callable[[], Any] = lambda: value
+        self._revision = users_functions.revision
+        is_locked = self.is_image and _is_locked(value)
+        if is_locked:
+            # A preview that is kept keeps no array.
+            self._reference, self._range = ref(value), look.around.range_of(value)
+        is_scalar = type(value) in _SCALARS or (type(value) is str and len(value) <= _SHORT_TEXT)
+        self.is_constant = (is_locked or is_scalar) and not is_in_users_code() and not is_shown_by_user(type(value))
+
+    def is_of(self, value: Any, look: Look) -> bool:
+        """Whether it is the preview of this value, as it is looked at now: in this range, by these functions."""
+        if self._reference() is not value or self._revision != users_functions.revision:
+            return False
+        return self._range is None or self._range == look.around.range_of(value)
+
+    def finished(self, value: Any, look: Look, most_bytes: int) -> Preview:
+        """Return the preview with a thumbnail of at most so many bytes."""
+        made = self._made
+        if made is None or made[1] != most_bytes:
+            self._made = made = finished(self.sketch or sketch(value, look), most_bytes), most_bytes
+        return made[0]
+
+
+def _is_locked(array: Any) -> bool:
+    """Whether no part of an array can be written, through whatever array that has its memory."""
+    while type(array) is np.ndarray:
+        if array.flags.writeable:
+            return False
+        array = array.base
+    return array is None
+
+
+# By name, and by whether it is of a hyperparameter's first value.
+_Kept = dict[tuple[str, bool], _TokenPreview]
+_kept: WeakKeyDictionary[Program, _Kept] = WeakKeyDictionary()
+
+
 class _Found(NamedTuple):
-    shown: ValuePreview
+    shown: _TokenPreview
     value: Any
     look: Look
 
 
-class _Known(NamedTuple):
-    """The previews that are kept of a program's tokens; in a nested look, each value is named only."""
-
-    kept: dict[tuple[str, bool], ValuePreview]
-    is_nested: bool
-
-    def find(self, name: str, value: Any, look: Look, *, is_first: bool = False) -> _Found:
-        key = name, is_first
-        shown = self.kept.get(key)
-        if shown is None or self.is_nested or not shown.is_of(value, look):
-            shown = ValuePreview(value, look, self.is_nested)
-            if shown.is_constant:
-                self.kept[key] = shown
-        return _Found(shown, value, look)
+def _find(kept: _Kept, key: tuple[str, bool], value: Any, look: Look) -> _Found:
+    """Look at a value, if its preview is not kept."""
+    shown = kept.get(key)
+    if shown is None or not shown.is_of(value, look):
+        shown = _TokenPreview(value, look)
+        if shown.is_constant:
+            kept[key] = shown
+    return _Found(shown, value, look)
 
 
 class Room(NamedTuple):
@@ -87,19 +166,18 @@ def token_views(
     tuple
         The tokens, and how many thumbnails were left out.
     """
-    program = None if run is None else run.tokens.program
-    values = {**_computed(run), **hparams.values}
-    with preview_context() as is_nested:
-        known = _Known({} if program is None else kept_previews(program), is_nested)
-        found: dict[str, _Found] = {}
-        for token in structure.tokens:
-            if (name := token.name) in values:
-                look = Look(token.order)
-                if run is not None and program is not None:
-                    look = Look(token.order, partial(kept_range, program, name), RunSurroundings(run, name))
-                found[name] = known.find(name, values[name], look)
-        previews, dropped = _with_thumbnails(found, _rank(run, found, targets), room)
-        first = _first_texts(structure, hparams, known)
+    values, kept = dict(hparams.values), _Kept()
+    if run is not None:
+        kept = _kept.setdefault(run.tokens.program, kept)
+        pairs = zip(run.tokens.program.tokens, run.tokens.values, strict=True)
+        values = {name: value for name, value in pairs if value is not NOT_COMPUTED} | values
+    found: dict[str, _Found] = {}
+    for token in structure.tokens:
+        if (name := token.name) in values:
+            look = Look(token.order) if run is None else Look(token.order, RunSurroundings(run, name))
+            found[name] = _find(kept, (name, False), values[name], look)
+    previews, dropped = _with_thumbnails(found, _rank(run, found, targets), room)
+    first = _first_texts(structure, hparams, kept)
     for each in found.values():
         each.shown.sketch = None
 
@@ -111,13 +189,6 @@ def token_views(
         return TokenView(name, role, state, previews.get(name), token.order, first.get(name, ""), by, before)
 
     return tuple(map(view, structure.tokens)), dropped
-
-
-def _computed(run: Run | None) -> dict[str, Any]:
-    if run is None:
-        return {}
-    pairs = zip(run.tokens.program.tokens, run.tokens.values, strict=True)
-    return {name: value for name, value in pairs if value is not NOT_COMPUTED}
 
 
 def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]) -> Rank:
@@ -137,7 +208,7 @@ def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]
     return rank
 
 
-def _first_texts(structure: GraphView, hparams: HyperparameterValues, known: _Known) -> dict[str, str]:
+def _first_texts(structure: GraphView, hparams: HyperparameterValues, kept: _Kept) -> dict[str, str]:
     """Return the texts of the first values of hyperparameters that have another one now."""
     texts = {}
     for token in structure.tokens:
@@ -145,7 +216,7 @@ def _first_texts(structure: GraphView, hparams: HyperparameterValues, known: _Kn
         if name in hparams.first and name in hparams.values:
             first, value = hparams.first[name], hparams.values[name]
             if first is not value and not is_same_value(first, value):
-                shown = known.find(name, first, Look(token.order), is_first=True).shown
+                shown = _find(kept, (name, True), first, Look(token.order)).shown
                 texts[name], shown.sketch = shown.brief.text, None
     return texts
 

@@ -5,9 +5,9 @@ Painters read the frozen GraphView and nothing else, so their colours and labels
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, Protocol, get_args
+from typing import Any, Final, get_args
 
 from epypes.display.previews.short import reason
 from epypes.display.text import (
@@ -16,6 +16,7 @@ from epypes.display.text import (
     THUMBNAIL_CHARACTERS,
     cut,
     duration_text,
+    listed,
     overhead_text,
     short_name,
 )
@@ -37,25 +38,6 @@ _STAGE_STATES: Final = ("static", "running", "stopped", "failed")
 _NOTE_CHARACTERS: Final = 200
 _MOST_STAGES: Final = 12
 _MOST_NOTES: Final = 6
-
-
-class PipelineLike(Protocol):
-    """What is shown of a pipeline."""
-
-    @property
-    def name(self) -> str:
-        """Stands on the frame."""
-
-    @property
-    def runner(self) -> CompGraphRunner:
-        """Is shown inside the frame."""
-
-    @property
-    def stages(self) -> Any:
-        """Has ``before`` and ``after``: records with kind, name, state and notes."""
-
-
-Shown = CompGraph | CompGraphRunner | Run | Plan | PipelineLike
 
 
 def view(
@@ -123,7 +105,7 @@ def _graph_of(shown: Any) -> CompGraph:
     return runner.cg
 
 
-def _whole(shown: Shown, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
+def _whole(shown: Any, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     """Look at all functions; thumbnails that are in closed groups are dropped first."""
     if isinstance(shown, CompGraph):
         # Tokens with a default are shown as the hyperparameters that a runner makes of them.
@@ -182,43 +164,40 @@ def _run_view(
     caption = f"{duration_text(report.total_ns)} in all, {overhead}"
     if dropped:
         caption += f"; {dropped} thumbnails left out to keep the picture small"
-    functions = tuple(map(_run_function_view(run, stale), structure.functions))
-    edges = (
-        tuple(
-            edge._replace(is_live=False) if functions[edge.function].state == "skipped" else edge
-            for edge in structure.edges
-        )
-        if program.has_skipped
-        else structure.edges
-    )
+    functions, edges = _run_functions(run, structure.functions, stale), structure.edges
+    if program.has_skipped:
+        skipped = {place for place, function in enumerate(functions) if function.state == "skipped"}
+        edges = tuple(edge._replace(is_live=edge.is_live and edge.function not in skipped) for edge in edges)
     return _captioned(structure, caption, functions=functions, tokens=tokens, edges=edges)
 
 
-def _run_function_view(run: Run, stale: Collection[str]) -> Callable[[FunctionView], FunctionView]:
+def _run_functions(run: Run, functions: Iterable[FunctionView], stale: Collection[str]) -> tuple[FunctionView, ...]:
     report, failure = run.report, run.failure
     entries: Mapping[str, FunctionTime] = {entry.function: entry for entry in report.functions}
     total_ns = max(report.total_ns, 1)
     lacking = run.tokens.lacking() if report.skipped else {}
-
-    def function_view(function: FunctionView) -> FunctionView:
+    seen = []
+    for function in functions:
         name, entry = function.name, entries.get(function.name)
         if failure and failure.function == name:
-            duration_ns = entry.duration_ns if entry else None
-            return function._replace(state="failed", duration_ns=duration_ns, message=failure.message or failure.kind)
-        if function.state == "left out":
-            return function
-        if name in stale:
+            duration_ns, message = entry.duration_ns if entry else None, failure.message or failure.kind
+            function = function._replace(state="failed", duration_ns=duration_ns, message=message)
+        elif function.state == "left out":
+            pass
+        elif name in stale:
             made = run.cg.func_outputs(name)
             is_new = made and not any(map(run.tokens.is_computed, made))
-            return function._replace(state="not run" if is_new else "stale")
-        if entry is not None and entry.skipped:
-            return function._replace(state="skipped", message=f"{', '.join(map(repr, lacking[name]))}: nothing found")
-        if entry is None or not entry.ran:
-            return function._replace(state="reused")
-        share = entry.duration_ns / total_ns
-        return function._replace(state="ran", duration_ns=entry.duration_ns, share=share)
-
-    return function_view
+            function = function._replace(state="not run" if is_new else "stale")
+        elif entry is not None and entry.skipped:
+            message = f"{', '.join(map(repr, lacking[name]))}: nothing found"
+            function = function._replace(state="skipped", message=message)
+        elif entry is None or not entry.ran:
+            function = function._replace(state="reused")
+        else:
+            share = entry.duration_ns / total_ns
+            function = function._replace(state="ran", duration_ns=entry.duration_ns, share=share)
+        seen.append(function)
+    return tuple(seen)
 
 
 def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
@@ -235,18 +214,14 @@ def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Seque
         )
         tokens, _ = token_views(structure, hparams, lambda name: "not computed", room)
         graph = _captioned(structure, "not run yet", functions=functions, tokens=tokens)
-    return _with_running(graph, running) if running else graph
-
-
-def _with_running(graph: GraphView, running: Sequence[str]) -> GraphView:
+    if not running:
+        return graph
     functions = tuple(
-        function._replace(state="running", message="", duration_ns=None, share=0.0)
-        if function.name in running
-        else function
-        for function in graph.functions
+        each._replace(state="running", message="", duration_ns=None, share=0.0) if each.name in running else each
+        for each in graph.functions
     )
-    more = f" and {len(running) - _NAMED} more" * (len(running) > _NAMED)
-    return _captioned(graph, f"running: {', '.join(map(short_name, running[:_NAMED]))}{more}", functions=functions)
+    names = listed([short_name(name) for name in running], _NAMED)
+    return _captioned(graph, f"running: {names}", functions=functions)
 
 
 # -- plans ---------------------------------------------------------------------------------------------------------
@@ -285,21 +260,16 @@ def _plan_caption(plan: Plan) -> str:
         parts.append(f"{placeholders} still to be written")
     text = ", ".join(parts)
     if plan.targets:
-        text += f"; asked for: {_some(plan.targets)}"
+        text += f"; asked for: {listed(plan.targets, _NAMED)}"
     if plan.missing:
-        text += f"; missing: {_some(plan.missing)}: call {run_call(plan.missing[:_NAMED])}"
+        text += f"; missing: {listed(plan.missing, _NAMED)}: call {run_call(plan.missing[:_NAMED])}"
     return text
-
-
-def _some(names: tuple[str, ...]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 # -- pipelines -----------------------------------------------------------------------------------------------------
 
 
-def _in_pipeline(graph: GraphView, pipeline: PipelineLike) -> GraphView:
+def _in_pipeline(graph: GraphView, pipeline: Any) -> GraphView:
     """Return the view of a pipeline's graph with the frame and the stages around it.
 
     Stages that can't be had are left out: they come from properties that users may override.

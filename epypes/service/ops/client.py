@@ -39,15 +39,15 @@ class Answer:
     timings_ns
         Nanoseconds by function.
     total_ns, overhead_ns
-        The run's time in the service, and the graph's part of it.
+        The run's time in the service, and the graph's part of it; None if an f_out of the bundle's own leaves them out.
     round_trip_ns
         From sending to receiving, on the caller's clock.
     """
 
     tokens: Mapping[str, Any]
     timings_ns: Mapping[str, int]
-    total_ns: int
-    overhead_ns: int
+    total_ns: int | None
+    overhead_ns: int | None
     round_trip_ns: int
 
 
@@ -219,7 +219,7 @@ def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collectio
     return Answer(
         in_order(answer, rgb),
         dict(answer.timings),
-        int(answer.attributes["total_ns"]),
-        int(answer.attributes["overhead_ns"]),
+        answer.attributes.get("total_ns"),
+        answer.attributes.get("overhead_ns"),
         round_trip_ns,
     )

@@ -165,8 +165,7 @@ def _opencv() -> Check:
 
 
 def _graphviz() -> Check:
-    from epypes.display.layout.geometry import Box
-    from epypes.display.layout.graphviz import routed_layout
+    from epypes.display.layout import Box, routed_layout
 
     engine = "pygraphviz" if find_spec("pygraphviz") else shutil.which("dot") or "none"
     try:

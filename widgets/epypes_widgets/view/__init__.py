@@ -116,6 +116,13 @@ class FrameSender:
         Is called with a key, a function and a delay in seconds: the function is to be called once after it, on any
         thread; a later call of the same key replaces an earlier one.
 
+    Attributes
+    ----------
+    newest
+        The frame that was offered last.
+    in_flight
+        The frame that was sent and is not acknowledged yet.
+
     Notes
     -----
     Nothing is sent before ``ready``: there is no view yet that could acknowledge it. A frame or an acknowledgement that
@@ -126,54 +133,43 @@ class FrameSender:
         self._send, self._later = send, later
         # Held while sending, so that frames leave in order. An answer within send() on this thread is allowed.
         self._lock = threading.RLock()
-        self._newest: Frame | None = None
-        self._in_flight: Frame | None = None
-        self._waiting = False
-        self._views = 0
-        self._was_mounted = False
+        self.newest: Frame | None = None
+        self.in_flight: Frame | None = None
+        self._is_waiting = False
+        self._views: int | None = None  # none has been mounted yet
         self._timeout_s = FIRST_TIMEOUT_S
-
-    @property
-    def in_flight(self) -> Frame | None:
-        """The frame that was sent and is not acknowledged yet."""
-        return self._in_flight
-
-    @property
-    def newest(self) -> Frame | None:
-        """The frame that was offered last."""
-        return self._newest
 
     @property
     def mounted(self) -> bool:
         """Whether there is a view."""
-        return self._views > 0
+        return bool(self._views)
 
     @property
     def left(self) -> bool:
         """Whether there was a view, and there is none any more."""
-        return self._was_mounted and not self._views
+        return self._views == 0
 
     def offer(self, frame: Frame) -> None:
         """Send a frame now, or when the one in flight has been painted, unless a newer one comes until then."""
         with self._lock:
-            self._newest, self._waiting = frame, True
+            self.newest, self._is_waiting = frame, True
             self._go_on()
 
     def painted(self, seq: int) -> Frame | None:
         """Take an acknowledgement; return the frame that it was for, None if it was late or came twice."""
         with self._lock:
-            frame = self._in_flight
+            frame = self.in_flight
             if frame is None or frame.seq != seq:
                 return None
-            self._in_flight, self._timeout_s = None, FIRST_TIMEOUT_S
+            self.in_flight, self._timeout_s = None, FIRST_TIMEOUT_S
             self._go_on()
             return frame
 
     def mount(self) -> None:
         """Take note that there is one more view, which is not to get frames yet."""
         with self._lock:
-            self._views += 1
-            self._was_mounted, self._waiting, self._in_flight = True, False, None
+            self._views = (self._views or 0) + 1
+            self._is_waiting, self.in_flight = False, None
 
     def ready(self) -> None:
         """Start over with the newest frame: what was in flight may be lost to a view that has just been mounted."""
@@ -187,18 +183,19 @@ class FrameSender:
         A page that is loaded anew does not say that its views are gone; more of them are then counted than there are.
         """
         with self._lock:
-            self._views = max(0, self._views - 1)
+            if self._views is not None:
+                self._views = max(0, self._views - 1)
             if not self._views:
-                self._in_flight = None
+                self.in_flight = None
 
     def _start_over(self) -> None:
-        self._in_flight, self._waiting = None, self._newest is not None
+        self.in_flight, self._is_waiting = None, self.newest is not None
         self._go_on()
 
     def _go_on(self) -> None:
-        frame = self._newest
-        if self._views and self._waiting and self._in_flight is None and frame is not None:
-            self._in_flight, self._waiting = frame, False
+        frame = self.newest
+        if self._views and self._is_waiting and self.in_flight is None and frame is not None:
+            self.in_flight, self._is_waiting = frame, False
             # Asked for first: an answer within send() sends the next frame, whose time-out must replace this one.
             self._later("lost frame", partial(self._overdue, frame), self._timeout_s)
             self._send(frame)
@@ -206,7 +203,7 @@ class FrameSender:
     def _overdue(self, frame: Frame) -> None:
         """Take a frame, or its acknowledgement, for lost."""
         with self._lock:
-            if self._in_flight is frame and self._views:
+            if self.in_flight is frame and self._views:
                 self._timeout_s = min(2 * self._timeout_s, LAST_TIMEOUT_S)
                 self._start_over()
 

@@ -1,22 +1,28 @@
 // The toolbar above the picture: live, undo and redo, zoom, comparison, histogram, marks, probe, rectangle; and its keys.
 import { targetLabel } from "./compare.js";
-import { consume, element, iconButton, note, say, textButton } from "./elements.js";
+import { ARROWS, consume, element, iconButton, note, say, textButton } from "./elements.js";
 
-const PERCENT = 100;
 const TYPED_IN = "input, select, textarea";
-const PANS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 export function barPart(panel, { stage, compare, histogram, probe, roi }) {
   const group = (label, ...children) => element("span", "epypes-group", { role: "group", "aria-label": label }, ...children);
   const asking = (icon, label, message, name) => iconButton(icon, label, () => panel.send(message), name);
-  const toggling = (icon, label, toggle, name) => iconButton(icon, label, () => (toggle(), refresh()), name);
-  const toggle = {
-    histogram: () => histogram.toggle(),
-    log: () => histogram.toggleLog(),
-    marks: () => stage.box.classList.toggle("epypes-without-marks"),
-    cross: () => probe.toggleCross(),
-    roi: () => roi.toggle(),
+  const escape = () => {
+    roi.stop();
+    if (probe.isCrossed) probe.toggleCross();
   };
+  const keys = {
+    "+": stage.zoomIn, "=": stage.zoomIn, "-": stage.zoomOut, 0: stage.fit, 1: stage.actualSize, f: () => compare.flip(true), p: () => probe.toggleCross(), escape,
+  };
+  /** What is on or off, by the buttons that show it. */
+  const isOnOf = new Map();
+  /** A button that is pressed while something is on; its key does the same as a click. */
+  function toggling(icon, label, key, isOn, toggle, name) {
+    const made = iconButton(icon, label, () => (toggle(), refresh()), name);
+    isOnOf.set(made, isOn);
+    if (key) keys[key] = toggle;
+    return made;
+  }
   const live = textButton("Live", onLive, "epypes-live-switch", "Compute while values are moved");
   live.prepend(element("span", "epypes-lamp", { "aria-hidden": "true" }));
   live.setAttribute("role", "switch");
@@ -27,13 +33,15 @@ export function barPart(panel, { stage, compare, histogram, probe, roi }) {
   const scale = textButton("100 %", stage.actualSize, "epypes-scale", "Pixel for pixel (1)");
   const select = element("select", "epypes-compare", { "aria-label": "Compare with", title: "Compare with" });
   const flip = iconButton("flip", "Flip to the other picture while held (f)", () => undefined);
-  const wipe = toggling("wipe", "Wipe between the two pictures (w)", () => compare.toggle("wipe"), "epypes-wipe");
-  const side = toggling("side", "Side by side (s)", () => compare.toggle("side"), "epypes-side-button");
-  const bars = toggling("histogram", "Histogram (h)", toggle.histogram, "epypes-histogram-button");
-  const log = toggling("log", "Logarithmic counts (l)", toggle.log);
-  const marks = toggling("marks", "Marks on the picture (o)", toggle.marks);
-  const probed = toggling("probe", "Values of the pixel under the pointer (p: by keys)", () => probe.toggle());
-  const draw = toggling("roi", "Draw a rectangle (r)", toggle.roi, "epypes-roi-button");
+  isOnOf.set(flip, () => compare.isFlipped);
+  const wipe = toggling("wipe", "Wipe between the two pictures (w)", "w", () => compare.mode === "wipe", () => compare.toggle("wipe"), "epypes-wipe");
+  const side = toggling("side", "Side by side (s)", "s", () => compare.mode === "side", () => compare.toggle("side"), "epypes-side-button");
+  const bars = toggling("histogram", "Histogram (h)", "h", () => histogram.isOn, () => histogram.toggle(), "epypes-histogram-button");
+  const log = toggling("log", "Logarithmic counts (l)", "l", () => histogram.isLogarithmic, () => histogram.toggleLog());
+  const hidden = "epypes-without-marks";
+  const marks = toggling("marks", "Marks on the picture (o)", "o", () => !stage.box.classList.contains(hidden), () => stage.box.classList.toggle(hidden));
+  const probed = toggling("probe", "Values of the pixel under the pointer (p: by keys)", "", () => probe.isOn, () => probe.toggle());
+  const draw = toggling("roi", "Draw a rectangle (r)", "r", () => roi.isDrawing, () => roi.toggle(), "epypes-roi-button");
   const root = element(
     "div",
     "epypes-bar",
@@ -56,11 +64,7 @@ export function barPart(panel, { stage, compare, histogram, probe, roi }) {
   }
 
   function refresh() {
-    const pressed = [
-      [wipe, compare.mode === "wipe"], [side, compare.mode === "side"], [flip, compare.isFlipped], [bars, histogram.isOn],
-      [log, histogram.isLogarithmic], [marks, !stage.box.matches(".epypes-without-marks")], [probed, probe.isOn], [draw, roi.isDrawing],
-    ];
-    for (const [button, on] of pressed) note(button, "aria-pressed", on);
+    for (const [made, isOn] of isOnOf) note(made, "aria-pressed", isOn());
     note(live, "aria-checked", isLive && !isClosed);
     log.disabled = !histogram.isOn;
     draw.disabled = !roi.exists;
@@ -90,17 +94,7 @@ export function barPart(panel, { stage, compare, histogram, probe, roi }) {
   flip.addEventListener("pointerdown", () => compare.flip(true));
   flip.addEventListener("keydown", (event) => [" ", "Enter"].includes(event.key) && compare.flip(true));
   for (const end of ["pointerup", "pointercancel", "pointerleave", "keyup", "blur"]) flip.addEventListener(end, () => compare.flip(false));
-  stage.watch(() => say(scale, `${Math.round(stage.place.scale * PERCENT)} %`));
-
-  const keys = {
-    "+": stage.zoomIn, "=": stage.zoomIn, "-": stage.zoomOut, 0: stage.fit, 1: stage.actualSize,
-    h: toggle.histogram, l: toggle.log, o: toggle.marks, p: toggle.cross, r: toggle.roi,
-    w: () => compare.toggle("wipe"), s: () => compare.toggle("side"), f: () => compare.flip(true),
-    escape() {
-      roi.stop();
-      if (probe.isCrossed) probe.toggleCross();
-    },
-  };
+  stage.watch(() => say(scale, `${Math.round(stage.place.scale * 100)} %`));
 
   /** Do what a key means; return whether it means anything here. */
   function act(event) {
@@ -108,9 +102,9 @@ export function barPart(panel, { stage, compare, histogram, probe, roi }) {
     if (event.ctrlKey || event.metaKey) {
       if (isTheirs(event)) return false;
       panel.send({ kind: key === "y" || event.shiftKey ? "redo" : "undo" });
-    } else if (event.key in PANS) {
+    } else if (event.key in ARROWS) {
       if (event.target !== stage.box) return false;
-      const [right, down] = PANS[event.key];
+      const [right, down] = ARROWS[event.key];
       if (!(event.shiftKey && probe.moveCross(right, down, event.altKey))) stage.pan(right, down);
     } else {
       if (!keys[key] || event.altKey) return false;

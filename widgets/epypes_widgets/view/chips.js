@@ -1,5 +1,5 @@
 // The stages as tabs: which is shown, which are pinned, and the state of each.
-import { element, icon, note, say, walkAlong } from "./elements.js";
+import { button, element, icon, note, say, walkAlong } from "./elements.js";
 
 const STATES = {
   fresh: ["", ""],
@@ -19,19 +19,18 @@ export function chipsPart(panel) {
   function make({ token, is_picture }) {
     const sign = element("span", "epypes-sign", { "aria-hidden": "true" });
     const kind = is_picture ? "epypes-chip" : "epypes-chip epypes-as-text";
-    const chip = element("button", kind, { type: "button", role: "tab", "data-token": token, tabindex: "-1", "aria-selected": "false" }, token, sign);
-    const pin = element("button", "epypes-pin", { type: "button", "aria-pressed": "false", tabindex: "-1" }, icon("pin"));
-    chip.addEventListener("click", () => panel.chooseStage(token));
-    pin.addEventListener("click", () => {
-      const on = !pinned.has(token);
-      if (on) pinned.add(token);
-      else pinned.delete(token);
-      showPins();
-      panel.send({ kind: "pin", token, on });
-    });
-    const both = element("span", "epypes-chip-box", { role: "presentation" }, chip, ...(is_picture ? [pin] : []));
+    const chip = button(kind, { role: "tab", "data-token": token, tabindex: "-1", "aria-selected": "false" }, () => panel.chooseStage(token), token, sign);
+    const pin = button("epypes-pin", { "aria-pressed": "false", tabindex: "-1" }, () => toggle(token), icon("pin"));
+    const both = element("span", "epypes-chip-box", { role: "presentation" }, chip, is_picture ? pin : null);
     chips.set(token, { chip, pin, sign, both });
     return both;
+  }
+
+  function toggle(token) {
+    const on = !pinned.delete(token);
+    if (on) pinned.add(token);
+    showPins();
+    panel.send({ kind: "pin", token, on });
   }
 
   function select(token) {

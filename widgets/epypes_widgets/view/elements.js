@@ -4,6 +4,9 @@ const SVG = "http://www.w3.org/2000/svg";
 const FIRST_ANSWER_MS = 500;
 const LAST_ANSWER_MS = 8000;
 
+/** Where each arrow key goes: to the right, and down. */
+export const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+
 /** Strokes in a square of 16 by 16. */
 const ICONS = {
   undo: "M6 3 2.5 6.5 6 10M3 6.5h6.5a3.5 3.5 0 0 1 0 7H7",
@@ -28,11 +31,11 @@ const ICONS = {
 
 function built(made, attributes, children) {
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, String(value));
-  made.append(...children);
+  made.append(...children.filter((child) => child !== null));
   return made;
 }
 
-/** @returns {any} an element with these classes */
+/** @returns {any} an element with these classes; a child may be null */
 export function element(tag, name = "", attributes = {}, ...children) {
   const made = built(document.createElement(tag), attributes, children);
   if (name) made.className = name;
@@ -49,6 +52,13 @@ export function say(node, text) {
   if (node && node.textContent !== text) node.textContent = text;
 }
 
+/** Say what came of something that was asked for; a refusal has a sign, too. */
+export function answer(node, text, isGood = true) {
+  say(node, text && !isGood ? `! ${text}` : text);
+  note(node, "title", text);
+  node.classList.toggle("epypes-refused", !isGood);
+}
+
 /** Set an attribute only when it changes. */
 export function note(node, name, value) {
   if (node && node.getAttribute(name) !== String(value)) node.setAttribute(name, String(value));
@@ -58,17 +68,25 @@ export function icon(name) {
   return shape("svg", { viewBox: "0 0 16 16", class: "epypes-icon", "aria-hidden": "true" }, shape("path", { d: ICONS[name] }));
 }
 
-/** A button with a picture, and a name that is its tooltip. */
-export function iconButton(drawn, label, press, name = "") {
-  const made = element("button", `epypes-button ${name}`, { type: "button", "aria-label": label, title: label }, icon(drawn));
+export function button(name, attributes, press, ...children) {
+  const made = element("button", name, { type: "button", ...attributes }, ...children);
   made.addEventListener("click", press);
   return made;
 }
 
-export function textButton(text, press, name = "", title = "") {
-  const made = element("button", `epypes-button epypes-worded ${name}`, { type: "button", title }, text);
-  made.addEventListener("click", press);
-  return made;
+/** A button with a picture, and a name that is its tooltip. */
+export const iconButton = (drawn, label, press, name = "") => button(`epypes-button ${name}`, { "aria-label": label, title: label }, press, icon(drawn));
+
+export const textButton = (text, press, name = "", title = "") => button(`epypes-button epypes-worded ${name}`, { title }, press, text);
+
+/** Keep one thing with a node for each key: those that are missing are made, those that are not wanted any more removed. */
+export function keep(things, keys, make) {
+  for (const [key, { node }] of things) {
+    if (keys.includes(key)) continue;
+    node.remove();
+    things.delete(key);
+  }
+  for (const key of keys) if (!things.has(key)) things.set(key, make(key));
 }
 
 /** Make a node follow the pointer from a press to its release, wherever that happens. */
@@ -78,14 +96,13 @@ export function follow(node, begin) {
     if (!drag) return;
     event.preventDefault();
     event.stopImmediatePropagation();
-    const moved = (later) => drag.move(later);
+    const over = new AbortController();
     node.setPointerCapture(event.pointerId);
-    node.addEventListener("pointermove", moved);
-    const ended = () => {
-      node.removeEventListener("pointermove", moved);
+    node.addEventListener("pointermove", drag.move, { signal: over.signal });
+    node.addEventListener("lostpointercapture", () => {
+      over.abort();
       drag.end?.();
-    };
-    node.addEventListener("lostpointercapture", ended, { once: true });
+    }, { once: true });
   });
 }
 
@@ -119,39 +136,18 @@ export function fill(img, bytes, type = "image/jpeg") {
   return undefined;
 }
 
-/** Call back with the closest element of a selector once a node is in the page; return what ends that. */
-export function whenInside(node, selector, found) {
-  const sizes = new ResizeObserver(() => {
-    const outer = node.closest(selector);
-    if (!outer) return;
-    sizes.disconnect();
-    found(outer);
-  });
-  sizes.observe(node);
-  return () => sizes.disconnect();
-}
-
 /**
- * Send "ready" until it is answered, and hide the static output below a living view; return what ends both.
+ * Send "ready" until it is answered; return what ends that.
  *
  * Until JupyterLab has a thread for widgets beside that of the cells, a message waits for a cell that runs: then it is
  * sent again, and the thread that is there by then handles it.
  */
-export function mounted(root, live, send) {
+export function announced(send) {
   let knocking = 0;
-  let area = null;
   const knock = (answer_ms) => {
     send({ kind: "ready" });
     knocking = setTimeout(() => knock(Math.min(2 * answer_ms, LAST_ANSWER_MS)), answer_ms);
   };
-  const stopLooking = whenInside(root, ".jp-OutputArea", (found) => (area = found).classList.add(live));
   knock(FIRST_ANSWER_MS);
-  return {
-    answered: () => clearTimeout(knocking),
-    close() {
-      clearTimeout(knocking);
-      stopLooking();
-      area?.classList.remove(live);
-    },
-  };
+  return () => clearTimeout(knocking);
 }

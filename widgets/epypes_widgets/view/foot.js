@@ -1,14 +1,8 @@
 // The foot of the view: a line of code, named settings, promoting or writing back, and a log.
-import { element, iconButton, note, say, textButton } from "./elements.js";
+import { answer, element, iconButton, note, say, textButton } from "./elements.js";
 
 const COPIED_MS = 1500;
 const DIFF_LINES = [["---", "epypes-diff-file"], ["+++", "epypes-diff-file"], ["+", "epypes-added"], ["-", "epypes-removed"]];
-
-function tell(node, text, isGood = true) {
-  say(node, text && !isGood ? `! ${text}` : text);
-  node.title = text;
-  node.classList.toggle("epypes-refused", !isGood);
-}
 
 const outcome = (name = "epypes-outcome") => element("span", `epypes-message ${name}`, { role: "status" });
 const line = (status, ...asking) => element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, ...asking), status);
@@ -23,14 +17,14 @@ function settingsLine(panel) {
   function onSetting(kind) {
     const asked = name.value.trim();
     if (asked) panel.send({ kind, name: asked });
-    else tell(status, "Give the settings a name.", false);
+    else answer(status, "Give the settings a name.", false);
   }
 
   name.addEventListener("keydown", (event) => event.key === "Enter" && onSetting("save"));
   return {
     line: line(status, list, name, save, load),
     offer: (names) => list.replaceChildren(...names.map((one) => element("option", "", { value: one }))),
-    tell: (text, isGood) => tell(status, text, isGood),
+    tell: (text, isGood) => answer(status, text, isGood),
   };
 }
 
@@ -41,7 +35,7 @@ function promoteLine(panel) {
 
   function onPromote() {
     promote.disabled = true;
-    tell(status, "Promoting…");
+    answer(status, "Promoting…");
     panel.send({ kind: "promote", to: to.value.trim() });
   }
 
@@ -51,7 +45,7 @@ function promoteLine(panel) {
     propose: (folder) => (to.value ||= folder),
     show({ state, text }) {
       promote.disabled = state === "running";
-      tell(status, text || "Promoting…", state !== "refused");
+      answer(status, text || "Promoting…", state !== "refused");
     },
   };
 }
@@ -75,7 +69,7 @@ function writeBackLine(panel) {
     disable(isRunning);
     ask.hidden = state === "diff" || (isRunning && !write.hidden);
     write.hidden = cancel.hidden = !ask.hidden;
-    tell(status, text, state !== "refused");
+    answer(status, text, state !== "refused");
     if (isRunning) return;
     diff.hidden = !changes;
     const kind = (one) => DIFF_LINES.find(([sign]) => one.startsWith(sign))?.[1];

@@ -1,5 +1,5 @@
 // Histograms of the stage shown and of those that thresholds cut, with the thresholds as lines.
-import { consume, element, follow, note, say, shape } from "./elements.js";
+import { consume, element, follow, keep, note, say, shape } from "./elements.js";
 import { FAST, clamped, ends, shortly, stepped, written } from "./numbers.js";
 
 const NEAR_THE_END = 0.75;
@@ -43,7 +43,6 @@ export function histogramPart(panel) {
   let cuts = [];
   let isOn = false;
   let isLogarithmic = false;
-  let dragged = "";
   let last = null;
   let isSetUp = false;
 
@@ -61,9 +60,8 @@ export function histogramPart(panel) {
     if (!found) return;
     const { row, index } = found;
     const next = moved(row, index, row.names.map((one) => panel.state.values[one]));
-    panel.state.values[name] = next;
-    putLine(chart, name);
-    panel.set({ [name]: next }, false);
+    panel.change(name, next, false);
+    chart.lines.get(name)?.put();
   }
 
   function makeLine(chart, name, at) {
@@ -71,52 +69,50 @@ export function histogramPart(panel) {
     const line = shape("line", { y1: "0", y2: "100%", class: "epypes-cut-line" });
     const text = shape("text", { y: 13 + 14 * at, class: "epypes-cut-text" });
     const label = `${name} on the histogram of ${chart.token}`;
-    const group = shape("g", { class: "epypes-cut", role: "slider", tabindex: "0", "data-name": name, "aria-label": label }, hit, line, text);
-    follow(group, () => {
+    const node = shape("g", { class: "epypes-cut", role: "slider", tabindex: "0", "data-name": name, "aria-label": label }, hit, line, text);
+    follow(node, () => {
       const box = chart.svg.getBoundingClientRect();
-      group.focus({ preventScroll: true });
-      dragged = name;
-      panel.hold([name]);
+      node.focus({ preventScroll: true });
+      panel.grab(name);
       return {
         move({ clientX }) {
           const value = valueAt(chart.histogram, (clientX - box.left) / box.width);
           moveTo(chart, name, (row, index, values) => clamped(row, index, value, values));
         },
         end() {
-          dragged = "";
-          panel.set({ [name]: panel.state.values[name] }, true);
-          panel.release([name]);
+          panel.change(name, panel.state.values[name], true);
+          panel.letGo(name);
         },
       };
     });
-    group.addEventListener("keydown", (event) => {
+    node.addEventListener("keydown", (event) => {
       if (event.key === "Enter") panel.release([name]);
       const count = LINE_KEYS[event.key] * (event.shiftKey ? FAST : 1);
       if (!count) return;
       consume(event);
       moveTo(chart, name, (row, index, values) => stepped(row, index, values[index], count, values));
     });
-    group.addEventListener("blur", () => panel.commit());
-    chart.svg.append(group);
-    return { group, hit, line, text };
-  }
+    node.addEventListener("blur", () => panel.commit());
+    chart.svg.append(node);
 
-  function putLine(chart, name) {
-    const parts = chart.lines.get(name);
-    const value = panel.state.values[name];
-    if (!parts || typeof value !== "number") return;
-    const share = shareOf(chart.histogram, value);
-    const [x, isNearEnd] = [`${(share * 100).toFixed(3)}%`, share > NEAR_THE_END];
-    for (const line of [parts.hit, parts.line]) for (const end of ["x1", "x2"]) note(line, end, x);
-    note(parts.text, "x", x);
-    note(parts.text, "dx", isNearEnd ? -5 : 5);
-    note(parts.text, "text-anchor", isNearEnd ? "end" : "start");
-    say(parts.text, `${name} ${shortly(value)}`);
-    const { row, index } = panel.rowOf(name) ?? {};
-    const { low, high } = row ? ends(row, index, []) : chart.histogram;
-    note(parts.group, "aria-valuenow", written(value));
-    note(parts.group, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
-    note(parts.group, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
+    /** Stand where the value is. */
+    function put() {
+      const value = panel.state.values[name];
+      if (typeof value !== "number") return;
+      const share = shareOf(chart.histogram, value);
+      const [x, isNearEnd] = [`${(share * 100).toFixed(3)}%`, share > NEAR_THE_END];
+      for (const drawn of [hit, line]) for (const end of ["x1", "x2"]) note(drawn, end, x);
+      note(text, "x", x);
+      note(text, "dx", isNearEnd ? -5 : 5);
+      note(text, "text-anchor", isNearEnd ? "end" : "start");
+      say(text, `${name} ${shortly(value)}`);
+      const { row, index } = panel.rowOf(name) ?? {};
+      const { low, high } = row ? ends(row, index, []) : chart.histogram;
+      note(node, "aria-valuenow", written(value));
+      note(node, "aria-valuemin", written(Number.isFinite(low) ? low : chart.histogram.low));
+      note(node, "aria-valuemax", written(Number.isFinite(high) ? high : chart.histogram.high));
+    }
+    return { node, put };
   }
 
   function paint(token, histogram) {
@@ -138,15 +134,8 @@ export function histogramPart(panel) {
 
   function putLines(chart) {
     const names = cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
-    for (const [name, { group }] of chart.lines) {
-      if (names.includes(name)) continue;
-      group.remove();
-      chart.lines.delete(name);
-    }
-    names.forEach((name, at) => {
-      if (!chart.lines.has(name)) chart.lines.set(name, makeLine(chart, name, at));
-      if (dragged !== name) putLine(chart, name);
-    });
+    keep(chart.lines, names, (name) => makeLine(chart, name, names.indexOf(name)));
+    for (const name of names) if (!panel.isHeld(name)) chart.lines.get(name).put();
   }
 
   function show(frame = last) {
@@ -185,6 +174,5 @@ export function histogramPart(panel) {
     },
     get isOn() { return isOn; },
     get isLogarithmic() { return isLogarithmic; },
-    isHeld: (name) => dragged === name,
   };
 }

@@ -2,7 +2,7 @@
 import { barPart } from "./bar.js";
 import { chipsPart } from "./chips.js";
 import { comparePart } from "./compare.js";
-import { element, mounted, note, say } from "./elements.js";
+import { announced, element, note, say } from "./elements.js";
 import { footPart } from "./foot.js";
 import { clear, failures, framesPart } from "./frames.js";
 import { histogramPart } from "./histogram.js";
@@ -16,6 +16,8 @@ import { rowsPart } from "./rows.js";
 import { stagePart } from "./stage.js";
 import { filmsPart, historyPart, pinnedPart, videoPart } from "./strips.js";
 
+/** Messages that parts handle in a method of that name. */
+const PASSED_ON = ["latency", "history", "cases", "probe", "settings", "promoted", "written", "optimised", "log"];
 const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load", "optimise_use"];
 
 /** The line above the picture, and the one below it for what went wrong. */
@@ -75,6 +77,7 @@ function render({ model, el }) {
   const failed = failures();
   let described = null;
   let shownFailure = null;
+  let held = "";
   /** What the parts share. */
   const panel = {
     ...out,
@@ -82,6 +85,20 @@ function render({ model, el }) {
     compare: /** @type {any} */ (null),
     state: { token: "", values: {} },
     tell: (text, isPassing) => header.tell(text, isPassing),
+    change(name, value, commit) {
+      panel.state.values[name] = value;
+      out.set({ [name]: value }, commit);
+    },
+    /** A value is dragged on a picture: no frame moves it until it is let go. */
+    grab(name) {
+      held = name;
+      out.hold([name]);
+    },
+    letGo(name) {
+      held = "";
+      out.release([name]);
+    },
+    isHeld: (name) => held === name,
     /** Write down what a frame has beside its picture once it has been painted; only the newest if several come. */
     describe(report) {
       if (!described) setTimeout(describe);
@@ -105,7 +122,7 @@ function render({ model, el }) {
   const histogram = histogramPart(panel);
   bar = barPart(panel, { stage, compare, histogram, probe, roi });
   const chips = chipsPart(panel);
-  const rows = rowsPart(panel, figure);
+  const rows = rowsPart(panel, figure, closing.signal);
   const pinned = pinnedPart(panel);
   const films = filmsPart(panel);
   const video = videoPart(panel);
@@ -129,8 +146,7 @@ function render({ model, el }) {
     const { frame } = report;
     panel.state.token = frame.token;
     for (const [name, value] of Object.entries(frame.values)) {
-      const isHeld = roi.isHeld(name) || histogram.isHeld(name);
-      if (!isHeld && out.takes(name, value)) panel.state.values[name] = value;
+      if (name !== held && out.takes(name, value)) panel.state.values[name] = value;
     }
     figure.classList.remove("epypes-empty");
     tellFailure();
@@ -145,7 +161,7 @@ function render({ model, el }) {
   }
 
   function setup(message, buffers) {
-    mount.answered();
+    answered();
     panel.state.token = message.token ?? "";
     all("setup", message, buffers);
     // What asks the kernel to compute rests with a panel that is closed; its picture can still be looked at.
@@ -168,26 +184,17 @@ function render({ model, el }) {
       stage.wait(isInPlace ? text : "");
       header.tell(isInPlace ? "" : text);
     },
-    latency: header.latency,
-    history: (message, buffers) => all("history", message, buffers),
-    cases: films.cases,
-    probe: probe.message,
-    settings: foot.settings,
-    promoted: foot.promoted,
-    written: foot.written,
-    optimised: optimise.optimised,
-    log: foot.log,
   };
+  for (const kind of PASSED_ON) handlers[kind] = (...given) => all(kind, ...given);
   const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);
   model.on("msg:custom", onMessage);
-  const mount = mounted(figure, "epypes-live", send);
+  const answered = announced(send);
   return () => {
-    mount.close();
+    answered();
     closing.abort();
     send({ kind: "closed" });
     model.off("msg:custom", onMessage);
     out.close();
-    rows.close();
     stage.close();
     [stage.picture, stage.other].forEach((img) => clear(img));
     figure.remove();

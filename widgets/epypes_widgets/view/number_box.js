@@ -40,9 +40,8 @@ export function numberBox(panel, row, index) {
   function place(value, commit) {
     restore();
     position = exact = value;
-    panel.state.values[name] = value;
     show();
-    panel.set({ [name]: value }, commit);
+    panel.change(name, value, commit);
   }
 
   /** Take what was typed; it stays, marked, if it can't be taken. */

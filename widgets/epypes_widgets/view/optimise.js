@@ -1,5 +1,5 @@
 // A search of hyperparameters: started, followed, stopped and used.
-import { element, note, say, shape, textButton } from "./elements.js";
+import { answer, element, note, say, shape, textButton } from "./elements.js";
 import { newestOnly } from "./protocol.js";
 
 const CURVE = { width: 600, height: 96, side: 8, above: 10, below: 10 };
@@ -49,7 +49,7 @@ export function optimisePart(panel) {
 
   function onStart() {
     if (!count.validity.valid) {
-      tell(`Give a number of trials from 1 to ${MOST_N}.`, true);
+      answer(status, `Give a number of trials from 1 to ${MOST_N}.`, false);
       return count.focus();
     }
     start.disabled = true;
@@ -59,12 +59,6 @@ export function optimisePart(panel) {
   function onStop() {
     stop.disabled = true;
     panel.send({ kind: "optimise_stop" });
-  }
-
-  function tell(text, isRefused) {
-    say(status, isRefused ? `! ${text}` : text);
-    note(status, "title", text);
-    status.classList.toggle("epypes-refused", isRefused);
   }
 
   function show(search) {
@@ -83,7 +77,7 @@ export function optimisePart(panel) {
     stop.disabled = search.state === "stopping";
     if (isFocused) (isRunning ? stop : start).focus();
     use.hidden = search.best === null;
-    tell(search.text, search.state === "refused");
+    answer(status, search.text, search.state !== "refused");
     say(setting, search.best === null ? "" : `Best: ${search.setting}`);
     draw(search);
     parts.hidden = search.importances.length < 2;

@@ -1,7 +1,6 @@
 // The contact sheet of a sweep, one tile of which is chosen with the mouse or with the keyboard.
-import { element, mounted, note, say } from "./elements.js";
+import { ARROWS, announced, button, element, note, say } from "./elements.js";
 
-const TOWARDS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 /** Straight on before aside. */
 const ASIDE = 4;
 
@@ -36,46 +35,43 @@ function render({ model, el }) {
   const send = (content) => model.send(content);
 
   /** The one tile that Tab comes to. */
-  function reach(button) {
-    for (const other of tiles()) other.tabIndex = other === button ? 0 : -1;
+  function reach(reached) {
+    for (const each of tiles()) each.tabIndex = each === reached ? 0 : -1;
   }
 
   function tile({ place, setting, failed, text, picture, label }) {
     const what = `${setting}: ${failed ? "failed, " : ""}${text}`;
     const name = failed ? "epypes-picker-tile epypes-picker-failed" : "epypes-picker-tile";
-    const words = () => element("span", "epypes-picker-text", {}, ...(failed ? [element("b", "", {}, "failed ")] : []), text);
+    const words = () => element("span", "epypes-picker-text", {}, failed ? element("b", "", {}, "failed ") : null, text);
     const shown = failed || picture === null ? words() : element("img", "", { alt: "", draggable: "false", src: urls[picture] });
-    const caption = label ? [element("span", "epypes-picker-label", {}, label)] : [];
-    const button = element("button", name, { type: "button", "data-place": place, "aria-label": what, title: what }, shown, ...caption);
-    button.addEventListener("click", () => {
-      reach(button);
-      button.focus();
+    const caption = label ? element("span", "epypes-picker-label", {}, label) : null;
+    const made = button(name, { "data-place": place, "aria-label": what, title: what }, () => {
+      reach(made);
+      made.focus();
       send({ kind: "pick", place });
-    });
-    return button;
+    }, shown, caption);
+    return made;
   }
 
   /** A table of rows and columns; where the sweep has neither, tiles one after the other. */
   function block({ title, rows: cells }, { rows, columns, row_labels, column_labels }) {
     if (!rows && !columns) {
       const flow = element("div", "epypes-picker-flow", {}, ...cells.flat(2).map(tile));
-      return element("div", "", {}, ...(title ? [element("div", "epypes-picker-title", {}, title)] : []), flow);
+      return element("div", "", {}, title ? element("div", "epypes-picker-title", {}, title) : null, flow);
     }
     const head = (text, scope, attributes = {}) => element("th", "", { scope, ...attributes }, text);
     const line = (...nodes) => element("tr", "", {}, ...nodes);
+    const first = (node) => (rows ? node() : null);
     const heads = columns
-      ? [line(...(rows ? [element("td")] : []), head(columns, "colgroup", { colspan: column_labels.length })),
-        line(...(rows ? [head(rows, "col")] : []), ...column_labels.map((label) => head(label, "col")))]
+      ? [line(first(() => element("td")), head(columns, "colgroup", { colspan: column_labels.length })),
+        line(first(() => head(rows, "col")), ...column_labels.map((label) => head(label, "col")))]
       : [line(head(rows, "col"), element("td"))];
-    const body = cells.map((row, at) => line(
-      ...(rows ? [head(row_labels[at], "row")] : []),
-      ...row.map((cell) => element("td", "", {}, ...cell.map(tile))),
-    ));
-    return element("table", "", {}, ...(title ? [element("caption", "", {}, title)] : []), ...heads, ...body);
+    const body = cells.map((row, at) => line(first(() => head(row_labels[at], "row")), ...row.map((cell) => element("td", "", {}, ...cell.map(tile)))));
+    return element("table", "", {}, title ? element("caption", "", {}, title) : null, ...heads, ...body);
   }
 
   function showSheet(message, buffers) {
-    mount.answered();
+    answered();
     urls.forEach(URL.revokeObjectURL);
     const media = {};
     message.blocks.forEach(({ rows }) => rows.flat(2).forEach(({ picture, media_type }) => (media[picture] = media_type)));
@@ -100,7 +96,7 @@ function render({ model, el }) {
   function showState(next) {
     state = next;
     root.classList.toggle("epypes-picker-busy", Boolean(state.busy));
-    for (const button of tiles()) note(button, "aria-pressed", Number(button.dataset.place) === state.chosen);
+    for (const each of tiles()) note(each, "aria-pressed", Number(each.dataset.place) === state.chosen);
     say(status, state.text);
     if (!sheet.querySelector("button[tabindex='0']")) reach(sheet.querySelector("button[aria-pressed='true']") ?? tiles()[0]);
   }
@@ -109,8 +105,8 @@ function render({ model, el }) {
     const from = document.activeElement;
     const all = tiles();
     if (!all.includes(from) || event.ctrlKey || event.metaKey || event.altKey) return;
-    const next = { Home: all[0], End: all.at(-1) }[event.key] ?? (TOWARDS[event.key] && neighbour(from, TOWARDS[event.key], all));
-    if (event.key in TOWARDS || next) event.preventDefault();
+    const next = { Home: all[0], End: all.at(-1) }[event.key] ?? (ARROWS[event.key] && neighbour(from, ARROWS[event.key], all));
+    if (event.key in ARROWS || next) event.preventDefault();
     event.stopPropagation();
     if (!next) return;
     reach(next);
@@ -119,9 +115,9 @@ function render({ model, el }) {
 
   const onMessage = (message, buffers) => (message.kind === "sheet" ? showSheet(message, buffers ?? []) : showState(message));
   model.on("msg:custom", onMessage);
-  const mount = mounted(root, "epypes-picker-live", send);
+  const answered = announced(send);
   return () => {
-    mount.close();
+    answered();
     model.off("msg:custom", onMessage);
     urls.forEach(URL.revokeObjectURL);
     root.remove();

@@ -93,7 +93,7 @@ export function probePart(panel, stage) {
   stage.watch(putCross);
 
   return {
-    message({ id, x, y, rows }) {
+    probe({ id, x, y, rows }) {
       if (!asked.answer(id) || x !== pixel?.x || y !== pixel?.y) return;
       say(heading, `x ${x}  y ${y}`);
       table.replaceChildren(...rows.map(row));

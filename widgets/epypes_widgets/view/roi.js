@@ -1,10 +1,9 @@
 // Rectangles over the picture: drawn anew, moved, and resized by eight handles or by keys.
-import { consume, follow, note, shape } from "./elements.js";
+import { ARROWS, consume, follow, keep, note, shape } from "./elements.js";
 import { FAST } from "./numbers.js";
 
 const HANDLE_PX = 9;
 const HANDLES = ["nw", "n", "ne", "e", "se", "s", "sw", "w"];
-const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 /** @typedef {[number, number, number, number]} Rectangle x, y, width, height in whole pixels */
 
@@ -47,7 +46,6 @@ export function roiPart(panel, stage) {
   const drawn = new Map();
   let entries = [];
   let isDrawing = false;
-  let dragged = "";
   const sizes = new Map();
 
   const valueOf = (name) => (isRectangle(panel.state.values[name]) ? panel.state.values[name] : whole(stage.size));
@@ -61,9 +59,8 @@ export function roiPart(panel, stage) {
   }
 
   function change(name, value, commit) {
-    panel.state.values[name] = value;
-    paint(name);
-    panel.set({ [name]: value }, commit);
+    panel.change(name, value, commit);
+    drawn.get(name).paint();
   }
 
   /** Follow a drag on a node: `moved` returns the rectangle; Escape gives back the one before. */
@@ -79,8 +76,7 @@ export function roiPart(panel, stage) {
       node.releasePointerCapture(event.pointerId);
     };
     window.addEventListener("keydown", cancel, true);
-    dragged = name;
-    panel.hold([name]);
+    panel.grab(name);
     return {
       move(later) {
         last = moved(start, from, at(later));
@@ -88,9 +84,8 @@ export function roiPart(panel, stage) {
       },
       end() {
         window.removeEventListener("keydown", cancel, true);
-        dragged = "";
         change(name, last, true);
-        panel.release([name]);
+        panel.letGo(name);
         setDrawing(false);
         drawn.get(name).frame.focus({ preventScroll: true });
       },
@@ -111,38 +106,35 @@ export function roiPart(panel, stage) {
     const frame = shape("rect", { class: "epypes-roi-frame", tabindex: "0", role: "group", focusable: "true" });
     const shadow = shape("rect", { class: "epypes-roi-shadow" });
     const handles = HANDLES.map((handle) => shape("rect", { class: "epypes-handle", "data-handle": handle, style: `cursor:${handle}-resize` }));
-    const group = shape("g", { class: "epypes-roi-one", "data-name": name }, shadow, frame, ...handles);
+    const node = shape("g", { class: "epypes-roi-one", "data-name": name }, shadow, frame, ...handles);
     follow(frame, (event) => drag(event, name, (start, from, to) => shifted(start, to.x - from.x, to.y - from.y, stage.size)));
-    for (const node of handles) {
-      const { handle } = node.dataset;
-      follow(node, (event) => drag(event, name, (start, from, to) => resized(start, handle, to.x - from.x, to.y - from.y, stage.size)));
-    }
+    HANDLES.forEach((handle, index) => {
+      follow(handles[index], (event) => drag(event, name, (start, from, to) => resized(start, handle, to.x - from.x, to.y - from.y, stage.size)));
+    });
     frame.addEventListener("keydown", (event) => onKey(event, name));
     frame.addEventListener("blur", () => panel.commit());
-    stage.roi.append(group);
-    return { group, frame, shadow, handles };
-  }
+    stage.roi.append(node);
 
-  function paint(name) {
-    const { group, frame, shadow, handles } = drawn.get(name);
-    const [x, y, width, height] = valueOf(name);
-    place(frame, [x, y, width, height]);
-    place(shadow, [x, y, width, height]);
-    note(frame, "aria-label", `${name}: ${width} by ${height} pixels at ${x}, ${y}. Arrows move it, with Shift they resize it, Delete takes the whole picture.`);
-    // A rectangle that is all of the picture is not moved, so a drag inside it pans.
-    group.classList.toggle("epypes-roi-whole", width === stage.size.width && height === stage.size.height);
-    const side = HANDLE_PX / stage.place.scale;
-    for (const node of handles) {
-      const along = (low, high, length) => (node.dataset.handle.includes(low) ? 0 : node.dataset.handle.includes(high) ? length : length / 2);
-      place(node, [x + along("w", "e", width) - side / 2, y + along("n", "s", height) - side / 2, side, side]);
+    function paint() {
+      const [x, y, width, height] = valueOf(name);
+      for (const rect of [frame, shadow]) place(rect, [x, y, width, height]);
+      note(frame, "aria-label", `${name}: ${width} by ${height} pixels at ${x}, ${y}. Arrows move it, with Shift they resize it, Delete takes the whole picture.`);
+      // A rectangle that is all of the picture is not moved, so a drag inside it pans.
+      node.classList.toggle("epypes-roi-whole", width === stage.size.width && height === stage.size.height);
+      const side = HANDLE_PX / stage.place.scale;
+      HANDLES.forEach((handle, index) => {
+        const along = (low, high, length) => (handle.includes(low) ? 0 : handle.includes(high) ? length : length / 2);
+        place(handles[index], [x + along("w", "e", width) - side / 2, y + along("n", "s", height) - side / 2, side, side]);
+      });
     }
+    return { node, frame, paint };
   }
 
   function show() {
     for (const entry of entries) {
       const isShown = fits(entry);
-      drawn.get(entry.name).group.style.display = isShown ? "" : "none";
-      if (isShown && dragged !== entry.name) paint(entry.name);
+      drawn.get(entry.name).node.style.display = isShown ? "" : "none";
+      if (isShown && !panel.isHeld(entry.name)) drawn.get(entry.name).paint();
     }
   }
 
@@ -162,12 +154,7 @@ export function roiPart(panel, stage) {
   return {
     setup(message) {
       entries = message.rois;
-      for (const [name, { group }] of drawn) {
-        if (entries.some((entry) => entry.name === name)) continue;
-        group.remove();
-        drawn.delete(name);
-      }
-      for (const { name } of entries) if (!drawn.has(name)) drawn.set(name, make(name));
+      keep(drawn, entries.map(({ name }) => name), make);
       show();
     },
     frame({ frame, main }) {
@@ -178,6 +165,5 @@ export function roiPart(panel, stage) {
     stop: () => setDrawing(false),
     get isDrawing() { return isDrawing; },
     get exists() { return entries.length > 0; },
-    isHeld: (name) => dragged === name,
   };
 }

@@ -1,65 +1,111 @@
 // What is added to the controls of ipywidgets: number boxes, resets, marks, folding and the filter.
-import { consume, element, iconButton, note, say, whenInside } from "./elements.js";
+import { consume, element, iconButton, note, say } from "./elements.js";
 import { numberBox } from "./number_box.js";
 import { inMs, modelValue, same, shortly, shownAt } from "./numbers.js";
 
 const NUMERIC = ["slider", "range", "log"];
 
-/** Decorates the rows of the panel that this view is in; they may come later than the view. */
-export function rowsPart(panel, figure) {
+/** Decorates the rows of the panel that this view is in until the signal; they may come later than the view. */
+export function rowsPart(panel, figure, signal) {
   let rows = [];
   let folders = [];
   let given = "";
   let root = null;
-  /** @type {Map<any, any>} by row */
+  /** @type {Map<any, any>} by row and by folder: its node, what was put into it, and a function that brings it up to date */
   const found = new Map();
-  /** @type {Map<any, any>} by folder */
-  const headings = new Map();
   let last = null;
   let failed = null;
-  const closing = new AbortController();
-  const until = { signal: closing.signal };
   const seeker = new MutationObserver(seek);
-
-  const stopLooking = whenInside(figure, ".epypes-panel", (outer) => {
-    root = outer;
-    root.addEventListener("pointerdown", onDown, { capture: true, ...until });
-    root.addEventListener("keydown", onEnter, { capture: true, ...until });
-    root.addEventListener("input", (event) => event.target.closest?.(".epypes-filter") && filter(), until);
-    root.addEventListener("focusin", (event) => nameHandles(rowAt(event.target)), until);
+  const placed = new ResizeObserver(() => {
+    root = figure.closest(".epypes-panel");
+    if (!root) return;
+    placed.disconnect();
+    root.addEventListener("pointerdown", onDown, { capture: true, signal });
+    root.addEventListener("keydown", onEnter, { capture: true, signal });
+    root.addEventListener("input", (event) => event.target.closest?.(".epypes-filter") && filter(), { signal });
+    root.addEventListener("focusin", (event) => nameHandles(rowAt(event.target)), { signal });
     seek();
+  });
+  placed.observe(figure);
+  signal.addEventListener("abort", () => {
+    for (const observer of [placed, seeker]) observer.disconnect();
+    clear();
   });
 
   function seek() {
     if (!root) return;
-    for (const row of rows) if (!found.get(row)?.tail.isConnected) decorate(row);
-    for (const folder of folders) if (!headings.get(folder)?.node.isConnected) decorateHeading(folder);
-    if (found.size < rows.length || headings.size < folders.length) seeker.observe(root, { childList: true, subtree: true });
+    for (const [all, decorate] of [[rows, decorateRow], [folders, decorateHeading]]) {
+      for (const one of all) {
+        const node = found.get(one)?.added.isConnected ? null : root.querySelector(`.${one.css}`);
+        const parts = node && decorate(one, node);
+        if (!parts) continue;
+        found.get(one)?.added.remove();
+        found.set(one, parts);
+        parts.update();
+        if (parts.boxes?.length) bind(one);
+      }
+    }
+    if (found.size < rows.length + folders.length) seeker.observe(root, { childList: true, subtree: true });
     else seeker.disconnect();
   }
 
-  function decorate(row) {
-    const node = root.querySelector(`.${row.css}`);
-    if (!node) return;
-    found.get(row)?.tail.remove();
+  function decorateRow(row, node) {
     const boxes = NUMERIC.includes(row.kind) ? row.names.map((_, index) => numberBox(panel, row, index)) : [];
     const sign = element("span", "epypes-fault", { role: "img" });
     const label = `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`;
     const reset = iconButton("reset", label, () => panel.send({ kind: "reset", names: row.names }), "epypes-reset");
-    const tail = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
-    boxes.forEach(({ input }, index) => tail.append(...(index ? ["–"] : []), input));
+    const added = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
+    boxes.forEach(({ input }, index) => added.append(...(index ? ["–"] : []), input));
     // Without a unit, too: the boxes stand below each other.
-    if (boxes.length || row.unit) tail.append(element("span", "epypes-unit", {}, row.unit));
-    if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi()));
-    if (row.kind !== "shown") tail.append(reset);
-    tail.append(sign);
+    if (boxes.length || row.unit) added.append(element("span", "epypes-unit", {}, row.unit));
+    if (row.kind === "roi") added.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi()));
+    if (row.kind !== "shown") added.append(reset);
+    added.append(sign);
     note(node, "data-kind", row.kind);
-    node.append(tail);
-    found.set(row, { node, tail, boxes, reset, sign });
-    nameHandles(row);
-    if (boxes.length) bind(row);
-    markChanged(row);
-    markFault(row);
+    node.append(added);
+
+    /** Show whether the row differs from its default, and whether a function failed by it. */
+    function update() {
+      const isChanged = row.names.some((name, index) => {
+        const value = boxes[index] ? boxes[index].value : panel.state.values[name];
+        return value !== undefined && row.default[index] !== null && !same(value, row.default[index]);
+      });
+      const isAtFault = row.names.some((name) => failed?.names?.includes(name));
+      node.classList.toggle("epypes-changed", isChanged);
+      reset.disabled = !isChanged;
+      node.classList.toggle("epypes-failed", isAtFault);
+      say(sign, isAtFault ? "!" : "");
+      if (isAtFault) note(sign, "aria-label", failed.text);
+      note(node, "title", isAtFault ? failed.text : row.tip);
+    }
+    return { node, added, boxes, update };
+  }
+
+  function decorateHeading(folder, node) {
+    const heading = node.querySelector(".epypes-heading");
+    if (!heading?.querySelector(".epypes-name")) return null;
+    const added = element("span", "epypes-fault epypes-heading-fault");
+    const attributes = { role: "button", tabindex: "0", "aria-expanded": "true", "data-lm-suppress-shortcuts": "true" };
+    for (const [name, value] of Object.entries(attributes)) note(heading, name, value);
+    heading.append(added);
+    const fold = () => note(heading, "aria-expanded", !node.classList.toggle("epypes-folded"));
+    heading.addEventListener("click", fold, { signal });
+    heading.addEventListener("keydown", (event) => {
+      if (!["Enter", " "].includes(event.key)) return;
+      consume(event);
+      fold();
+    }, { signal });
+
+    /** Show how long the function took, and whether it failed. */
+    function update() {
+      const ms = last?.times_ms?.[folder.function];
+      if (ms !== undefined) say(heading.querySelector(".epypes-time"), inMs(ms));
+      const isAtFault = failed?.function === folder.function;
+      heading.classList.toggle("epypes-failed", isAtFault);
+      say(added, isAtFault ? "! failed" : "");
+      note(heading, "title", isAtFault ? failed.text : "");
+    }
+    return { node, added, update };
   }
 
   /** Sliders of the library have no names of their own. */
@@ -68,69 +114,19 @@ export function rowsPart(panel, figure) {
   }
 
   async function bind(row) {
+    nameHandles(row);
     const model = await panel.widgetModel(row.model);
-    if (!model || closing.signal.aborted) return;
+    if (!model || signal.aborted) return;
     const update = () => moved(row, model.get("value"));
     model.on("change:value", update);
-    closing.signal.addEventListener("abort", () => model.off("change:value", update));
+    signal.addEventListener("abort", () => model.off("change:value", update));
     update();
   }
 
   /** A slider has come to a place. */
   function moved(row, value) {
     found.get(row)?.boxes.forEach((box, index) => box.moved(shownAt(row, [value].flat()[index])));
-    markChanged(row);
-  }
-
-  function markChanged(row) {
-    const parts = found.get(row);
-    if (!parts) return;
-    const isChanged = row.names.some((name, index) => {
-      const value = parts.boxes[index] ? parts.boxes[index].value : panel.state.values[name];
-      return value !== undefined && row.default[index] !== null && !same(value, row.default[index]);
-    });
-    parts.node.classList.toggle("epypes-changed", isChanged);
-    parts.reset.disabled = !isChanged;
-  }
-
-  function markFault(row) {
-    const parts = found.get(row);
-    if (!parts) return;
-    const isAtFault = row.names.some((name) => failed?.names?.includes(name));
-    parts.node.classList.toggle("epypes-failed", isAtFault);
-    say(parts.sign, isAtFault ? "!" : "");
-    if (isAtFault) note(parts.sign, "aria-label", failed.text);
-    note(parts.node, "title", isAtFault ? failed.text : row.tip);
-  }
-
-  function decorateHeading(folder) {
-    const node = root.querySelector(`.${folder.css}`);
-    const heading = node?.querySelector(".epypes-heading");
-    if (!heading?.querySelector(".epypes-name")) return;
-    const sign = element("span", "epypes-fault epypes-heading-fault");
-    const attributes = { role: "button", tabindex: "0", "aria-expanded": "true", "data-lm-suppress-shortcuts": "true" };
-    for (const [name, value] of Object.entries(attributes)) note(heading, name, value);
-    heading.append(sign);
-    const fold = () => note(heading, "aria-expanded", !node.classList.toggle("epypes-folded"));
-    heading.addEventListener("click", fold, until);
-    heading.addEventListener("keydown", (event) => {
-      if (!["Enter", " "].includes(event.key)) return;
-      consume(event);
-      fold();
-    }, until);
-    headings.set(folder, { node, heading, sign });
-    describe(folder);
-  }
-
-  function describe(folder) {
-    const parts = headings.get(folder);
-    if (!parts) return;
-    const ms = last?.times_ms?.[folder.function];
-    if (ms !== undefined) say(parts.heading.querySelector(".epypes-time"), inMs(ms));
-    const isAtFault = failed?.function === folder.function;
-    parts.heading.classList.toggle("epypes-failed", isAtFault);
-    say(parts.sign, isAtFault ? "! failed" : "");
-    note(parts.heading, "title", isAtFault ? failed.text : "");
+    found.get(row)?.update();
   }
 
   function filter() {
@@ -143,7 +139,7 @@ export function rowsPart(panel, figure) {
       matches += Number(isMatch);
       found.get(row)?.node.classList.toggle("epypes-unmatched", !isMatch);
     }
-    for (const { node } of headings.values()) {
+    for (const { node } of folders.map((folder) => found.get(folder)).filter(Boolean)) {
       node.classList.toggle("epypes-unmatched", !node.querySelector(".epypes-row:not(.epypes-unmatched)"));
       node.classList.toggle("epypes-filtered", words.length > 0);
     }
@@ -180,10 +176,8 @@ export function rowsPart(panel, figure) {
   }
 
   function clear() {
-    for (const { tail } of found.values()) tail.remove();
-    for (const { sign } of headings.values()) sign.remove();
+    for (const { added } of found.values()) added.remove();
     found.clear();
-    headings.clear();
   }
 
   return {
@@ -199,26 +193,18 @@ export function rowsPart(panel, figure) {
     },
     frame({ frame }) {
       last = frame;
-      for (const row of rows) {
-        found.get(row)?.boxes.forEach((box) => box.name in frame.values && box.ran(frame.values[box.name]));
-        markChanged(row);
+      for (const { boxes = [], update } of found.values()) {
+        boxes.forEach((box) => box.name in frame.values && box.ran(frame.values[box.name]));
+        update();
       }
-      folders.forEach(describe);
     },
     failure(failure) {
       failed = failure;
-      rows.forEach(markFault);
-      folders.forEach(describe);
+      for (const { update } of found.values()) update();
     },
     rowOf(name) {
       const row = rows.find((one) => one.names.includes(name));
       return row ? { row, index: row.names.indexOf(name) } : null;
-    },
-    close() {
-      closing.abort();
-      stopLooking();
-      seeker.disconnect();
-      clear();
     },
   };
 }

@@ -1,5 +1,5 @@
 // Below the big picture: pinned stages, test images or the slider of a video's frames, and the history.
-import { element, fill, iconButton, note, say, walkAlong } from "./elements.js";
+import { button, element, fill, iconButton, keep, note, say, walkAlong } from "./elements.js";
 import { FRAME } from "./protocol.js";
 
 const VERDICTS = { passed: "✓ pass", failed: "✗ fail", waiting: "… waits" };
@@ -14,9 +14,8 @@ function strip(name, label) {
 function small(attributes, press, ...caption) {
   const img = element("img", "epypes-thumbnail", { alt: "", draggable: "false" });
   const text = element("span", "epypes-small-text", { hidden: "" });
-  const button = element("button", "epypes-small", { type: "button", ...attributes }, img, text, element("span", "epypes-caption", {}, ...caption));
-  button.addEventListener("click", press);
-  return { img, text, button };
+  const node = button("epypes-small", attributes, press, img, text, element("span", "epypes-caption", {}, ...caption));
+  return { img, text, node };
 }
 
 /** The stages that are kept in sight; a click shows one. */
@@ -27,27 +26,22 @@ export function pinnedPart(panel) {
 
   function make(token) {
     const made = small({ "data-token": token, title: `Show ${token}` }, () => panel.chooseStage(token), token);
-    parts.set(token, made);
-    root.append(made.button);
+    root.append(made.node);
+    return made;
   }
 
   return {
     element: root,
     frame({ frame, shown }) {
       const pinned = shown.filter(({ picture }) => picture.role === "pinned");
-      for (const [token, { button }] of parts) {
-        if (pinned.some(({ picture }) => picture.token === token)) continue;
-        button.remove();
-        parts.delete(token);
-      }
+      keep(parts, pinned.map(({ picture }) => picture.token), make);
       for (const { picture, bytes } of pinned) {
-        if (!parts.has(picture.token)) make(picture.token);
-        const { img, text, button } = parts.get(picture.token);
+        const { img, text, node } = parts.get(picture.token);
         text.hidden = Boolean(bytes);
         img.hidden = !bytes;
         say(text, picture.text ?? "");
         fill(img, bytes, picture.media_type);
-        note(button, "aria-current", picture.token === frame.token);
+        note(node, "aria-current", picture.token === frame.token);
       }
       root.hidden = pinned.length === 0;
     },
@@ -62,32 +56,31 @@ export function filmsPart(panel) {
   let verdicts = [];
 
   function choose(chosen) {
-    for (const { index, button } of films) note(button, "aria-current", index === chosen);
+    for (const { index, node } of films) note(node, "aria-current", index === chosen);
   }
 
   /** By sign and text, since not everybody can tell their colours apart. */
   function judge() {
-    for (const { index, title, button, badge } of films) {
+    for (const { index, title, node, badge } of films) {
       const verdict = verdicts[index];
       badge.hidden = !verdict;
       if (!verdict) continue;
       note(badge, "data-state", verdict.state);
       say(badge, VERDICTS[verdict.state]);
       const label = `${title}: ${verdict.state === "waiting" ? "" : `${verdict.state}, `}${verdict.text}`;
-      note(button, "title", label);
-      note(button, "aria-label", label);
+      for (const name of ["title", "aria-label"]) note(node, name, label);
     }
   }
 
   function make({ index, title }, bytes) {
-    const { img, button } = small({ title }, () => {
+    const { img, node } = small({ title }, () => {
       choose(index);
       panel.send({ kind: "image", index });
     }, title);
     fill(img, bytes);
     const badge = element("span", "epypes-verdict", { hidden: "" });
-    button.append(badge);
-    return { index, title, button, badge };
+    node.append(badge);
+    return { index, title, node, badge };
   }
 
   return {
@@ -102,7 +95,7 @@ export function filmsPart(panel) {
     },
     setup({ images }, buffers) {
       films = images.map((image, at) => make(image, buffers[at]));
-      root.replaceChildren(...films.map(({ button }) => button));
+      root.replaceChildren(...films.map(({ node }) => node));
       root.hidden = images.length === 0;
       judge();
     },
@@ -175,13 +168,13 @@ export function historyPart(panel) {
     const name = entry.label || `#${entry.number}`;
     const text = entry.changed || "start";
     const attributes = { "data-number": entry.number, "aria-label": `Go to ${name}: ${text}`, title: `${name}: ${text}`, "aria-current": Boolean(entry.current) };
-    const { img, button } = small(attributes, () => panel.send({ kind: "goto", number: entry.number }), element("b", "", {}, name), ` ${text}`);
+    const { img, node } = small(attributes, () => panel.send({ kind: "goto", number: entry.number }), element("b", "", {}, name), ` ${text}`);
     const shown = images.get(entry.number) ?? img;
     img.replaceWith(shown);
     if (bytes?.byteLength) fill(shown, bytes);
     shown.hidden = !shown.src;
-    button.classList.add("epypes-entry");
-    return [entry.number, shown, button];
+    node.classList.add("epypes-entry");
+    return [entry.number, shown, node];
   }
 
   return {
@@ -190,9 +183,9 @@ export function historyPart(panel) {
       const focused = document.activeElement?.closest?.(".epypes-entry")?.dataset.number;
       const made = entries.map((entry, at) => make(entry, buffers[at]));
       images = new Map(made);
-      const buttons = made.map(([, , button]) => button);
-      list.replaceChildren(...buttons);
-      buttons.find((one) => one.dataset.number === focused)?.focus();
+      const nodes = made.map(([, , node]) => node);
+      list.replaceChildren(...nodes);
+      nodes.find((one) => one.dataset.number === focused)?.focus();
       // Only this strip is scrolled, never the page.
       const current = list.querySelector("[aria-current=true]");
       if (current) list.scrollLeft = current.offsetLeft - (list.clientWidth - current.offsetWidth) / 2;

@@ -1,5 +1,5 @@
 // The table of the events that failed, and how each is opened again.
-import { ask, confirmed, make, part, say } from "./server.js";
+import { ask, confirmed, entries, make, part, say } from "./server.js";
 
 const MOST = 50;
 const TEXT = 240;
@@ -7,7 +7,7 @@ const COPIED_MS = 1500;
 
 /** @typedef {{id: string, event_id: string, function: string, exception: string, message: string, kind: string, attempt: number, dead_letter: boolean, when_ns: number, has_event: boolean}} Failure */
 
-/** @type {Map<string, Failure>} */
+/** @type {Map<string, Failure>} by id */
 const known = new Map();
 
 /** Read the failures that are kept. */
@@ -26,26 +26,26 @@ export function sawFailure(failure) {
 function show() {
   // Ids rise with time.
   const ids = [...known.keys()].sort().reverse();
-  for (const id of ids.slice(MOST)) known.delete(id);
+  for (const id of ids.splice(MOST)) known.delete(id);
   const body = part("failures").tBodies[0];
-  /** @type {Map<string, Element>} */
   const rows = new Map([...body.rows].map((row) => [row.dataset.id, row]));
-  body.replaceChildren(...[...known.keys()].sort().reverse().map((id) => rows.get(id) ?? row(/** @type {Failure} */ (known.get(id)))));
+  body.replaceChildren(...ids.map((id) => rows.get(id) ?? row(known.get(id))));
   part("no-failures").hidden = known.size > 0;
   part("failures").parentElement.hidden = known.size === 0;
 }
 
-/** Show what is known of a failure, with its traceback. @param {string} id */
+const address = (id) => `v1/failures/${encodeURIComponent(id)}`;
+
+/** Show what is known of a failure, with its traceback. */
 async function open(id) {
   try {
-    const record = await ask(`v1/failures/${encodeURIComponent(id)}`);
-    await confirmed(`${record.exception || record.kind} in ${record.function || "the worker"}`, described(record), "");
+    const record = await ask(address(id));
+    await confirmed(`${record.exception || record.kind} in ${record.function || "the worker"}`, described(record));
   } catch (error) {
-    say("notice", /** @type {Error} */ (error).message);
+    say("notice", error.message);
   }
 }
 
-/** @param {Record<string, any>} record */
 function described(record) {
   const facts = {
     When: new Date(record.when_ns / 1e6).toLocaleString(),
@@ -56,20 +56,19 @@ function described(record) {
     Revision: String(record.revision),
     "Its frame": record.has_event ? "was kept" : "was not kept",
   };
-  const listed = Object.entries(facts).filter(([, text]) => text).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text)));
+  const trace = record.trace.map((line) => line.replace(/\n$/, "")).join("\n");
   return make(
     "div",
     {},
     make("p", { class: "message" }, record.message),
-    make("dl", { class: "record" }, ...listed),
-    record.trace.length ? make("pre", { tabindex: "0", "aria-label": "Traceback" }, record.trace.map((/** @type {string} */ line) => line.replace(/\n$/, "")).join("\n")) : make("p", { class: "quiet" }, "There is no traceback."),
-    make("p", {}, make("a", { href: `v1/failures/${encodeURIComponent(record.id)}` }, "The record as JSON")),
+    make("dl", { class: "record" }, ...entries(facts)),
+    trace ? make("pre", { tabindex: "0", "aria-label": "Traceback" }, trace) : make("p", { class: "quiet" }, "There is no traceback."),
+    make("p", {}, make("a", { href: address(record.id) }, "The record as JSON")),
   );
 }
 
-/** @param {string} id */
 function opener(id) {
-  const link = make("a", { href: `v1/failures/${encodeURIComponent(id)}`, title: "Show the record and its traceback" }, make("code", {}, id));
+  const link = make("a", { href: address(id), title: "Show the record and its traceback" }, make("code", {}, id));
   link.addEventListener("click", (event) => {
     event.preventDefault();
     void open(id);
@@ -77,7 +76,6 @@ function opener(id) {
   return link;
 }
 
-/** @param {Failure} failure */
 function row(failure) {
   const when = new Date(failure.when_ns / 1e6);
   const what = `${failure.exception}: ${failure.message}`.replace(/\s+/g, " ");
@@ -93,7 +91,6 @@ function row(failure) {
   );
 }
 
-/** @param {string} line @param {string} label */
 function copy(line, label) {
   const button = make("button", { type: "button", class: "small", "aria-label": label, title: label }, "Copy");
   const code = make("code", {}, line);

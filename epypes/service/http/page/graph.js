@@ -1,5 +1,5 @@
 // The picture of the graph follows the runs, and a token is shown larger when it is chosen.
-import { part } from "./server.js";
+import { make, part, request } from "./server.js";
 
 // A picture costs the worker some milliseconds; more of them could not be looked at.
 const LEAST_MS = 400;
@@ -39,13 +39,13 @@ export function watchGraph() {
   document.adoptedStyleSheets = [...document.adoptedStyleSheets, style];
   document.addEventListener("visibilitychange", () => isWanted && redraw());
   const graph = part("graph");
-  graph.addEventListener("click", (/** @type {Event} */ event) => look(vertexOf(event)));
-  graph.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+  graph.addEventListener("click", (event) => look(vertexOf(event)));
+  graph.addEventListener("keydown", (event) => {
     const vertex = event.key === "Enter" || event.key === " " ? vertexOf(event) : null;
     if (vertex) event.preventDefault();
     look(vertex);
   });
-  const dialog = /** @type {HTMLDialogElement} */ (part("look"));
+  const dialog = part("look");
   // The event of a closing comes later, and by then another token may have been chosen.
   dialog.addEventListener("close", () => dialog.open || (looked = ""));
 }
@@ -65,25 +65,22 @@ async function follow() {
 
 async function draw() {
   try {
-    const answer = await fetch("v1/graph.svg");
-    if (!answer.ok) throw new Error(String((await answer.json()).detail));
-    await swap(await answer.text());
+    await swap(await (await request("v1/graph.svg")).text());
     part("graph").classList.remove("old");
     showNote();
   } catch (error) {
     part("graph").classList.add("old");
-    part("graph-note").textContent = part("graph").firstChild ? "This picture is old: the service gives no newer one." : message(error);
+    part("graph-note").textContent = part("graph").firstChild ? "This picture is old: the service gives no newer one." : error.message;
   }
 }
 
-/** The picture takes the place of the one before once its images are decoded, so that nothing flickers. @param {string} text */
+/** The picture takes the place of the one before once its images are decoded, so that nothing flickers. */
 async function swap(text) {
   const svg = new DOMParser().parseFromString(withoutStyle(text), "image/svg+xml").documentElement;
   if (svg.nodeName !== "svg") throw new Error("The service sent no picture.");
-  const images = [...svg.querySelectorAll("image")].map((image) => decoded(image.getAttribute("href") ?? ""));
-  await Promise.all(images);
+  await Promise.all([...svg.querySelectorAll("image")].map((image) => decoded(image.getAttribute("href") ?? "")));
   const least = LEAST_WIDTH.exec(text)?.[1];
-  const shown = /** @type {SVGElement} */ (document.importNode(/** @type {any} */ (svg), true));
+  const shown = document.importNode(svg, true);
   if (least) shown.style.minWidth = `min(${least}, 100vw)`;
   for (const vertex of shown.querySelectorAll(`[id^=${TOKEN}]`)) {
     vertex.setAttribute("tabindex", "0");
@@ -91,32 +88,28 @@ async function swap(text) {
   }
   const focused = document.activeElement?.closest?.(`#graph [id^=${TOKEN}]`)?.id;
   part("graph").replaceChildren(shown);
-  if (focused) document.getElementById(focused)?.focus();
+  if (focused) part(focused)?.focus();
 }
 
-/** @param {string} source */
-async function decoded(source) {
-  const image = new Image();
-  image.src = source;
+/** Return an image once it can be shown. */
+async function decoded(src, alt = "") {
+  const image = Object.assign(new Image(), { src, alt });
   await image.decode().catch(() => undefined);
+  return image;
 }
 
-/** The page's policy knows no styles inside a document, so those of the picture become a sheet of the page. @param {string} text */
+/** The page's policy knows no styles inside a document, so those of the picture become a sheet of the page. */
 function withoutStyle(text) {
   const inside = STYLE.exec(text);
   if (inside) style.replaceSync(inside[1]);
   return text.replace(STYLE, "").replace(LEAST_WIDTH, "");
 }
 
-/** @param {Event} event @returns {Element | null} */
-function vertexOf(event) {
-  return /** @type {Element} */ (event.target)?.closest?.(`[id^=${TOKEN}]`) ?? null;
-}
+const vertexOf = (event) => event.target?.closest?.(`[id^=${TOKEN}]`) ?? null;
 
-/** Return the name in an id, where signs stand as ":2e:". @param {string} id */
+/** Return the name in an id, where signs stand as ":2e:". */
 const named = (id) => id.replace(/:([0-9a-f]+):/g, (_, code) => String.fromCodePoint(parseInt(code, 16)));
 
-/** @param {Element | null} vertex */
 function look(vertex) {
   if (!vertex) return;
   looked = named(vertex.id.slice(TOKEN.length));
@@ -126,36 +119,16 @@ function look(vertex) {
   void show(looked);
 }
 
-/** @param {string} token */
 async function show(token) {
-  const body = part("look-body");
-  try {
-    const answer = await fetch(`v1/tokens/${encodeURIComponent(token)}/preview?max_side_px=1024`);
-    if (!answer.ok) throw new Error(String((await answer.json()).detail));
-    const isText = (answer.headers.get("Content-Type") ?? "").startsWith("text/");
-    const next = isText ? preformatted(await answer.text()) : await pictured(await answer.blob(), token);
-    if (looked === token) body.replaceChildren(next);
-  } catch (error) {
-    if (looked === token) body.replaceChildren(preformatted(message(error)));
-  }
+  const next = await preview(token).catch((error) => make("pre", {}, error.message));
+  if (looked === token) part("look-body").replaceChildren(next);
 }
 
-/** @param {string} text */
-function preformatted(text) {
-  const shown = document.createElement("pre");
-  shown.textContent = text;
-  return shown;
-}
-
-/** @param {Blob} blob @param {string} token */
-async function pictured(blob, token) {
-  const image = new Image();
-  image.src = URL.createObjectURL(blob);
-  image.alt = `The value of ${token} in the latest run`;
-  await image.decode().catch(() => undefined);
-  URL.revokeObjectURL(image.src);
+async function preview(token) {
+  const answer = await request(`v1/tokens/${encodeURIComponent(token)}/preview?max_side_px=1024`);
+  if ((answer.headers.get("Content-Type") ?? "").startsWith("text/")) return make("pre", {}, await answer.text());
+  const url = URL.createObjectURL(await answer.blob());
+  const image = await decoded(url, `The value of ${token} in the latest run`);
+  URL.revokeObjectURL(url);
   return image;
 }
-
-/** @param {unknown} error */
-const message = (error) => (error instanceof TypeError ? "The service can't be reached." : String(/** @type {Error} */ (error).message));

@@ -4,15 +4,15 @@ import { redraw, sawPlace, watchGraph } from "./graph.js";
 import { sawParameters, showButtons, watchParameters } from "./parameters.js";
 import { sawCounts, sawRun } from "./rates.js";
 import { sawGroup } from "./replicas.js";
-import { ask, confirmed, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
+import { ask, confirmed, entries, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
 
-/** @type {Record<string, string>} */
 const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error", LOST: "error" };
+/** The states in which each operation makes sense. */
+const OPERATIONS = { pause: ["READY", "DEGRADED"], resume: ["PAUSED", "DRAINING"], drain: ["READY", "PAUSED", "DEGRADED"] };
 const DIGITS = 12;
 
 let state = "";
 
-/** @param {{state: string, reason: string}} now */
 function sawState(now) {
   state = now.state;
   const badge = part("state");
@@ -30,7 +30,7 @@ async function loadInfo() {
   part("name").textContent = info.name;
   document.title = `${info.name}: ${info.state}`;
   const facts = {
-    ...(info.replica ? { replica: info.replica } : {}),
+    replica: info.replica,
     bundle: info.bundle,
     digest: info.digest.slice(0, DIGITS),
     worker: info.worker_pid === null ? "none" : `process ${info.worker_pid}`,
@@ -42,22 +42,19 @@ async function loadInfo() {
     ...Object.fromEntries(Object.entries(info.colours ?? {}).map(([token, text]) => [`colours of ${token}`, text])),
   };
   sawPlace(info.addresses.sub, info.counts.answered > 0);
-  part("facts").replaceChildren(...Object.entries(facts).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text))));
+  part("facts").replaceChildren(...entries(facts));
 }
 
 function showOperations() {
-  part("pause").disabled = !hasToken() || !["READY", "DEGRADED"].includes(state);
-  part("resume").disabled = !hasToken() || !["PAUSED", "DRAINING"].includes(state);
-  part("drain").disabled = !hasToken() || !["READY", "PAUSED", "DEGRADED"].includes(state);
+  for (const [name, states] of Object.entries(OPERATIONS)) part(name).disabled = !hasToken() || !states.includes(state);
 }
 
-/** @param {string} path @param {unknown} [body] */
 async function operate(path, body = undefined) {
   try {
     await ask(path, "POST", body);
     say("notice", "");
   } catch (error) {
-    say("notice", /** @type {Error} */ (error).message);
+    say("notice", error.message);
     if (error instanceof Refused && error.status === 403) refuseToken();
   }
 }
@@ -73,7 +70,7 @@ function refuseToken() {
   say("notice", "This is not the service's access token. It is in the file that epypes serve names.");
 }
 
-/** Take an access token only if the service knows it. @param {string} given */
+/** Take an access token only if the service knows it. */
 async function useToken(given) {
   keepToken(given);
   try {
@@ -84,20 +81,19 @@ async function useToken(given) {
     if (error instanceof Refused && [401, 403].includes(error.status)) return refuseToken();
     keepToken("");
     showToken();
-    say("notice", /** @type {Error} */ (error).message);
+    say("notice", error.message);
   }
 }
 
 function showToken() {
-  part("token-hint").textContent = hasToken() ? "The access token is right: changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
-  part("token-form").querySelector("button").textContent = hasToken() ? "Forget" : "Use";
-  part("token").hidden = hasToken();
-  part("token-form").querySelector("label").hidden = hasToken();
+  const [form, isTaken] = [part("token-form"), hasToken()];
+  part("token-hint").textContent = isTaken ? "The access token is right: changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
+  form.querySelector("button").textContent = isTaken ? "Forget" : "Use";
+  part("token").hidden = form.querySelector("label").hidden = isTaken;
   showOperations();
   showButtons();
 }
 
-/** @param {boolean} isHeard */
 function onHeard(isHeard) {
   say("notice", isHeard ? "" : "The service can't be reached; it is asked again. What is shown may be old.");
   if (isHeard) {
@@ -118,7 +114,7 @@ watchParameters();
 showToken();
 takeGiven();
 addEventListener("hashchange", takeGiven);
-part("token-form").addEventListener("submit", (/** @type {Event} */ event) => {
+part("token-form").addEventListener("submit", (event) => {
   event.preventDefault();
   const given = hasToken() ? "" : part("token").value;
   part("token").value = "";
@@ -127,23 +123,18 @@ part("token-form").addEventListener("submit", (/** @type {Event} */ event) => {
 part("pause").addEventListener("click", () => void operate("v1/pause"));
 part("resume").addEventListener("click", () => void operate("v1/resume"));
 part("drain").addEventListener("click", () => void drain());
+const redrawn = (saw) => (data) => {
+  saw(data);
+  redraw();
+};
 hear(
   {
     state: sawState,
     counts: sawCounts,
     group: (group) => sawGroup(group, TONES),
-    parameters: (now) => {
-      sawParameters(now);
-      redraw();
-    },
-    run: (run) => {
-      sawRun(run);
-      redraw();
-    },
-    failure: (failure) => {
-      sawFailure(failure);
-      redraw();
-    },
+    parameters: redrawn(sawParameters),
+    run: redrawn(sawRun),
+    failure: redrawn(sawFailure),
   },
   onHeard,
 );

@@ -1,18 +1,18 @@
 // The fields of the parameters: what the service has, and what is changed here.
-import { ask, confirmed, hasToken, make, part, Refused, say } from "./server.js";
+import { ask, confirmed, hasToken, make, part, say } from "./server.js";
 
 const STEPS = 200;
 
 /** @typedef {{value?: any, kind?: string, type?: string, low?: number, high?: number, soft?: number[], step?: number, odd?: boolean, choices?: any[], unit?: string}} Entry */
 /** @typedef {{entry: Entry, box: HTMLElement, note: HTMLElement, read: () => any, write: (value: any) => void}} Field */
 
-/** @type {Map<string, Field>} */
+/** @type {Map<string, Field>} by token */
 const fields = new Map();
 let revision = 0;
 
 /** Let the buttons work. */
 export function watchParameters() {
-  part("parameters").addEventListener("submit", (/** @type {Event} */ event) => {
+  part("parameters").addEventListener("submit", (event) => {
     event.preventDefault();
     void apply();
   });
@@ -25,8 +25,7 @@ export function watchParameters() {
  * @param {{revision: number, parameters: Record<string, Entry>}} now
  */
 export function sawParameters(now) {
-  const wanted = changes();
-  const before = values();
+  const [wanted, before] = [changes(), values()];
   revision = now.revision;
   part("revision").textContent = `revision ${revision}`;
   if ([...fields.keys()].join("\n") !== Object.keys(now.parameters).join("\n")) {
@@ -45,21 +44,17 @@ export function sawParameters(now) {
 
 /** Show which buttons can be used. */
 export function showButtons() {
-  const isChanged = changes().size > 0;
-  part("apply").disabled = !isChanged || !hasToken();
-  part("undo").disabled = !isChanged;
-  part("write-back").disabled = !hasToken() || isChanged;
-  part("apply").textContent = isChanged ? `Apply ${changes().size}` : "Apply";
+  const count = changes().size;
+  part("apply").disabled = !count || !hasToken();
+  part("undo").disabled = !count;
+  part("write-back").disabled = !hasToken() || count > 0;
+  part("apply").textContent = count ? `Apply ${count}` : "Apply";
 }
 
-/** @returns {Map<string, any>} what was changed here, by token */
+/** What was changed here, by token. */
 function changes() {
-  const found = new Map();
-  for (const [token, field] of fields) {
-    const value = field.read();
-    if (!same(value, valueOf(field.entry))) found.set(token, value);
-  }
-  return found;
+  const read = [...fields].map(([token, field]) => [token, field.read()]);
+  return new Map(read.filter(([token, value]) => !same(value, valueOf(fields.get(token).entry))));
 }
 
 async function apply() {
@@ -74,23 +69,19 @@ async function apply() {
     say("parameters-note", "");
     sawParameters(now);
   } catch (error) {
-    refuse(/** @type {Refused} */ (error), wanted, before);
+    refuse(error, wanted, before);
   }
 }
 
-/** @returns {Map<string, any>} what is in the service, as far as it is known here, by token */
-function values() {
-  return new Map([...fields].map(([token, field]) => [token, valueOf(field.entry)]));
-}
+/** What is in the service, as far as it is known here, by token. */
+const values = () => new Map([...fields].map(([token, field]) => [token, valueOf(field.entry)]));
 
 /** @param {Refused} error @param {Map<string, any>} wanted @param {Map<string, any>} before */
 function refuse(error, wanted, before) {
   if (error.status === 409 && error.data.parameters) {
     sawParameters(error.data);
     // They may have been told of before the refusal came.
-    const theirs = [...values()]
-      .filter(([token, value]) => !same(before.get(token), value))
-      .map(([token, value]) => `${token}: ${text(before.get(token))} → ${text(value)}`);
+    const theirs = [...values()].filter(([token, value]) => !same(before.get(token), value)).map(([token, value]) => `${token}: ${text(before.get(token))} → ${text(value)}`);
     say("parameters-note", `Somebody else changed the parameters meanwhile, so nothing was applied. They are loaded anew (${theirs.join("; ")}). Yours are marked; apply again to use them.`, false);
     return;
   }
@@ -104,8 +95,10 @@ function refuse(error, wanted, before) {
 }
 
 function undo() {
-  for (const field of fields.values()) field.write(valueOf(field.entry));
-  for (const token of fields.keys()) mark(token);
+  for (const [token, field] of fields) {
+    field.write(valueOf(field.entry));
+    mark(token);
+  }
   say("parameters-note", "");
 }
 
@@ -117,17 +110,16 @@ async function writeBack() {
     const { digest } = await ask("v1/parameters/write-back", "POST", { dry_run: false });
     say("parameters-note", `Written. The bundle has the digest ${digest.slice(0, 12)} now.`, false);
   } catch (error) {
-    say("parameters-note", /** @type {Error} */ (error).message);
+    say("parameters-note", error.message);
   }
 }
 
-/** @param {string} diff */
 function painted(diff) {
   const kinds = new Map([["+", "added"], ["-", "removed"]]);
   return make("pre", { tabindex: "0" }, ...diff.split("\n").map((line) => make("span", { class: kinds.get(line[0]) ?? "" }, `${line}\n`)));
 }
 
-/** @param {string} token */
+/** Say below a field what is changed here, or what it may be. */
 function mark(token) {
   const field = fields.get(token);
   if (!field) return;
@@ -141,7 +133,6 @@ function mark(token) {
   showButtons();
 }
 
-/** @param {Entry} entry */
 function about(entry) {
   const range = entry.low !== undefined && entry.high !== undefined ? `${entry.low} to ${entry.high}` : "";
   return [range, entry.odd ? "odd" : "", entry.unit ?? ""].filter(Boolean).join(", ");
@@ -158,72 +149,63 @@ function made(token, entry) {
   return { entry, box, note, read, write };
 }
 
-/** @param {Record<string, string>} named @param {Entry} entry */
+/**
+ * Make what a parameter is edited with; what can't be read is read as undefined.
+ * @param {Record<string, string>} named @param {Entry} entry
+ */
 function control(named, entry) {
   const value = valueOf(entry);
   if (Array.isArray(entry.choices)) return choice(named, entry.choices);
-  if (typeof value === "boolean") return toggle(named);
   if (typeof value === "number") return number(named, entry);
-  return typed(named, typeof value === "string");
+  if (typeof value === "boolean") {
+    const box = make("input", { ...named, type: "checkbox", role: "switch" });
+    return { controls: [box], read: () => box.checked, write: (next) => (box.checked = Boolean(next)) };
+  }
+  const box = make("input", { ...named, type: "text", class: "text", spellcheck: "false" });
+  // What is no plain number, text or truth is written as JSON.
+  const isText = typeof value === "string";
+  return { controls: [box], read: () => (isText ? box.value : parsed(box.value)), write: (next) => (box.value = isText ? String(next) : JSON.stringify(next)) };
 }
 
-/** @param {Record<string, string>} named @param {any[]} choices */
 function choice(named, choices) {
-  const select = /** @type {HTMLSelectElement} */ (make("select", { ...named, class: "text" }));
-  const fill = (/** @type {any[]} */ all) => select.replaceChildren(...all.map((each) => make("option", { value: JSON.stringify(each) }, text(each))));
-  fill(choices);
+  const select = make("select", { ...named, class: "text" });
   return {
     controls: [select],
-    read: () => JSON.parse(select.value),
-    write: (/** @type {any} */ value) => {
-      if (!choices.some((each) => same(each, value))) fill([...choices, value]);
+    read: () => parsed(select.value),
+    write(value) {
+      const all = choices.some((each) => same(each, value)) ? choices : [...choices, value];
+      select.replaceChildren(...all.map((each) => make("option", { value: JSON.stringify(each) }, text(each))));
       select.value = JSON.stringify(value);
     },
   };
 }
 
-/** @param {Record<string, string>} named */
-function toggle(named) {
-  const box = /** @type {HTMLInputElement} */ (make("input", { ...named, type: "checkbox", role: "switch" }));
-  return { controls: [box], read: () => box.checked, write: (/** @type {any} */ value) => (box.checked = Boolean(value)) };
-}
-
-/** @param {Record<string, string>} named @param {Entry} entry */
 function number(named, entry) {
   const { low, high, soft = [] } = entry;
   // A number of JavaScript doesn't say whether it may have a fraction: 1.0 is 1.
   const step = entry.step ?? (entry.odd ? 2 : entry.type === "int" ? 1 : undefined);
   const [from, to] = [low ?? soft[0], high ?? soft[1]];
-  const limits = { ...(low === undefined ? {} : { min: String(low) }), ...(high === undefined ? {} : { max: String(high) }) };
-  const box = /** @type {HTMLInputElement} */ (make("input", { ...named, ...limits, type: "number", step: String(step ?? "any"), required: "" }));
-  const read = () => (box.value === "" ? undefined : Number(box.value));
-  if (from === undefined || to === undefined) return { controls: [box], read, write: (/** @type {any} */ value) => (box.value = String(value)) };
-  const slider = /** @type {HTMLInputElement} */ (
-    make("input", { min: String(from), max: String(to), type: "range", step: String(step ?? (to - from) / STEPS), "aria-label": `${named.id.slice("parameter-".length)}, slider` })
-  );
-  slider.addEventListener("input", () => (box.value = slider.value));
-  box.addEventListener("input", () => (slider.value = box.value));
-  const write = (/** @type {any} */ value) => (slider.value = box.value = String(value));
-  return { controls: [slider, box], read, write };
+  const limits = { ...(low === undefined ? {} : { min: low }), ...(high === undefined ? {} : { max: high }) };
+  const box = make("input", { ...named, ...limits, type: "number", step: step ?? "any", required: "" });
+  const controls = [box];
+  if (from !== undefined && to !== undefined) {
+    const slider = make("input", { min: from, max: to, type: "range", step: step ?? (to - from) / STEPS, "aria-label": `${named.id.slice("parameter-".length)}, slider` });
+    slider.addEventListener("input", () => (box.value = slider.value));
+    box.addEventListener("input", () => (slider.value = box.value));
+    controls.unshift(slider);
+  }
+  return { controls, read: () => (box.value === "" ? undefined : Number(box.value)), write: (value) => controls.forEach((each) => (each.value = String(value))) };
 }
 
-/** What is no plain number, text or truth is written as JSON. @param {Record<string, string>} named @param {boolean} isText */
-function typed(named, isText) {
-  const box = /** @type {HTMLInputElement} */ (make("input", { ...named, type: "text", class: "text", spellcheck: "false" }));
-  const parsed = () => {
-    try {
-      return JSON.parse(box.value);
-    } catch {
-      return undefined;
-    }
-  };
-  const write = (/** @type {any} */ value) => (box.value = isText ? String(value) : JSON.stringify(value));
-  return { controls: [box], read: () => (isText ? box.value : parsed()), write };
+function parsed(json) {
+  try {
+    return JSON.parse(json);
+  } catch {
+    return undefined;
+  }
 }
 
 /** @param {Entry} entry */
 const valueOf = (entry) => (entry?.kind === "none" ? null : entry?.value);
-/** @param {any} one @param {any} other */
 const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);
-/** @param {any} value */
 const text = (value) => (typeof value === "string" ? value : JSON.stringify(value));

@@ -9,7 +9,6 @@ const LABELS = {
   retried: "tried again", rejected: "rejected", waiting: "waiting", in_flight: "in work",
 };
 // Where a broker delivers the events.
-/** @type {Record<string, string>} */
 const OF_BROKER = { redelivered: "delivered again", duplicates: "duplicates", given_back: "given back" };
 const BAD = new Set(["failed", "dropped", "dead_letters", "rejected"]);
 
@@ -20,19 +19,19 @@ let last = null;
 /** @type {Record<string, {at: number, value: number | null}[]>} */
 const lines = { rate: [], p50: [], p95: [] };
 
-/** @param {{total_ns?: number}} run */
+/** Take note of how long a run took. @param {{total_ns?: number}} run */
 export function sawRun(run) {
   if (typeof run.total_ns === "number") runs.push({ at: performance.now(), ns: run.total_ns });
 }
 
-/** @param {Record<string, number>} counts */
+/** Show what was counted, and what that makes per second. @param {Record<string, number>} counts */
 export function sawCounts(counts) {
   const labels = Object.entries(OF_BROKER).filter(([name]) => name in counts);
   part("counts").replaceChildren(...[...Object.entries(LABELS), ...labels].map(([name, label]) => entry(label, counts[name] ?? 0, BAD.has(name))));
   const now = performance.now();
   // A service that was started anew counts from 0.
   if (last && counts.answered >= last.answered && now - last.at > 300) {
-    note("rate", ((counts.answered - last.answered) * 1000) / (now - last.at), perSecond);
+    note("rate", ((counts.answered - last.answered) * 1000) / (now - last.at), (value) => `${perSecond(value)} /s`);
     const recent = runs.filter((run) => now - run.at < 5000).map((run) => run.ns).sort((a, b) => a - b);
     note("p50", quantile(recent, 0.5), duration);
     note("p95", quantile(recent, 0.95), duration);
@@ -41,48 +40,36 @@ export function sawCounts(counts) {
   runs = runs.filter((run) => now - run.at < KEPT_S * 1000);
 }
 
-/** @param {string} label @param {number} count @param {boolean} isBad */
 function entry(label, count, isBad) {
   return make("div", isBad && count > 0 ? { class: "bad" } : {}, make("dt", {}, label), make("dd", {}, count.toLocaleString("en")));
 }
 
-/** @param {number[]} sorted @param {number} share */
 function quantile(sorted, share) {
   return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : null;
 }
 
-/** @param {string} name @param {number | null} value @param {(value: number) => string} written */
 function note(name, value, written) {
   const now = performance.now();
-  const line = lines[name].filter((point) => now - point.at < KEPT_S * 1000);
-  line.push({ at: now, value });
-  lines[name] = line;
+  const line = (lines[name] = [...lines[name].filter((point) => now - point.at < KEPT_S * 1000), { at: now, value }]);
   part(name).textContent = value === null ? "–" : written(value);
   draw(part(`${name}-line`), line, now, written);
 }
 
-/** @param {SVGElement} svg @param {{at: number, value: number | null}[]} line @param {number} now @param {(value: number) => string} written */
 function draw(svg, line, now, written) {
   const values = line.map((point) => point.value).filter((value) => value !== null);
   const most = Math.max(...values, 0) || 1;
-  let path = "", isDown = false;
-  for (const { at, value } of line) {
-    if (value !== null) {
-      const x = WIDTH * (1 - (now - at) / (KEPT_S * 1000)), y = HEIGHT - MARGIN - (value / most) * (HEIGHT - 2 * MARGIN);
-      path += `${isDown ? "L" : "M"}${x.toFixed(1)},${y.toFixed(1)}`;
-    }
-    isDown = value !== null;
-  }
-  const drawn = document.createElementNS("http://www.w3.org/2000/svg", "path");
-  drawn.setAttribute("d", path);
-  svg.replaceChildren(drawn);
+  const pieces = line.map(({ at, value }, index) => {
+    if (value === null) return "";
+    const x = WIDTH * (1 - (now - at) / (KEPT_S * 1000)), y = HEIGHT - MARGIN - (value / most) * (HEIGHT - 2 * MARGIN);
+    return `${(line[index - 1]?.value ?? null) === null ? "M" : "L"}${x.toFixed(1)},${y.toFixed(1)}`;
+  });
+  svg.firstElementChild.setAttribute("d", pieces.join(""));
   svg.setAttribute("aria-label", values.length ? `From ${written(Math.min(...values))} to ${written(Math.max(...values))}` : "No values yet");
 }
 
-/** @param {number} value */
-const perSecond = (value) => `${value.toFixed(value < 10 ? 1 : 0)} /s`;
+/** Return a rate as text: slow ones with a digit more. @param {number} rate */
+export const perSecond = (rate) => rate.toFixed(rate < 10 ? 1 : 0);
 
-/** @param {number} ns */
 function duration(ns) {
   const ms = ns / NS_PER_MS;
   if (ms < 1) return `${Math.round(ms * 1000)} µs`;

@@ -1,4 +1,5 @@
 // The table of the replicas that share the events.
+import { perSecond } from "./rates.js";
 import { make, part } from "./server.js";
 
 const DIGITS = 12;
@@ -15,12 +16,11 @@ let seen = new Map();
 /** @param {Group} group @param {Record<string, string>} tones by state */
 export function sawGroup(group, tones) {
   part("replicas-section").hidden = group.replicas < 2 && !group.trouble && !group.lost.length;
-  const note = [`${group.ready} of ${group.replicas} are ready; together they have answered ${total(group)} events.`];
+  const note = [`${group.ready} of ${group.replicas} are ready; together they have answered ${counted(group.counts.answered)} events.`];
   if (!group.agree) note.push("They do not all serve the same bundle with the same parameters just now.");
   if (group.trouble) note.push(`The others are not heard: ${group.trouble}`);
   part("replicas-note").textContent = note.join(" ");
   part("replicas-note").classList.toggle("warn", !group.agree || Boolean(group.trouble));
-  /** @type {typeof seen} */
   const now = new Map();
   const here = group.members.find((member) => member.is_self)?.host;
   const rows = group.members.map((member) => row(member, rate(member, now), tones, isReached(member, here)));
@@ -29,10 +29,9 @@ export function sawGroup(group, tones) {
   part("replicas").tBodies[0].replaceChildren(...rows);
 }
 
-/** @param {Group} group */
-const total = (group) => (group.counts.answered ?? 0).toLocaleString();
+const counted = (count = 0) => count.toLocaleString();
 
-/** Return how many events a replica answers per second. @param {Member} member @param {typeof seen} now */
+/** Return how many events a replica answers per second. */
 function rate(member, now) {
   const key = `${member.host} ${member.pid} ${member.replica}`;
   const before = seen.get(key);
@@ -41,35 +40,36 @@ function rate(member, now) {
   // It says how many each second; what was said is not older for being shown again.
   const isNews = !before || at - before.at > 300;
   const found = before && isNews && answered >= before.answered ? ((answered - before.answered) * 1000) / (at - before.at) : before?.rate ?? null;
-  now.set(key, isNews || !before ? { answered, at, rate: found } : before);
+  now.set(key, isNews ? { answered, at, rate: found } : before);
   return found;
 }
 
-/**
- * Return whether another replica's page can be opened from here; one on another machine may listen there alone.
- * @param {Member} member @param {string | undefined} here
- */
+/** Return whether another replica's page can be opened from here; one on another machine may listen there alone. */
 function isReached(member, here) {
   if (member.is_self || !/^https?:/.test(member.http)) return false;
   return member.host === here || !/^https?:\/\/(127\.|localhost|\[::1\])/.test(member.http);
 }
 
-/** @param {Member} member @param {number | null} perSecond @param {Record<string, string>} tones @param {boolean} isLinked */
-function row(member, perSecond, tones, isLinked) {
+function row(member, answeredPerSecond, tones, isLinked) {
+  const { counts } = member;
   const name = make("th", { scope: "row" }, isLinked ? make("a", { href: member.http }, member.replica) : member.replica);
   if (member.is_self) name.append(" ", make("small", {}, "this one"));
-  const state = make("span", { class: `badge ${tones[member.state] ?? ""}` }, member.state);
+  const state = make("td", {}, make("span", { class: `badge ${tones[member.state] ?? ""}` }, member.state));
   const why = [member.reason, member.trouble].filter(Boolean).join(" ");
-  const number = (/** @type {string} */ label, /** @type {string} */ text) => make("td", { class: "number", "data-label": label }, text);
-  const count = (/** @type {string} */ name) => member.counts[name] ?? 0;
-  const cells = [
-    make("td", {}, state, ...(why ? [make("div", { class: "quiet message" }, why)] : [])),
+  if (why) state.append(make("div", { class: "quiet message" }, why));
+  const numbers = {
+    Revision: String(member.revision),
+    "Answered per second": answeredPerSecond === null ? "–" : perSecond(answeredPerSecond),
+    Answered: counted(counts.answered),
+    Failed: counted((counts.failed ?? 0) + (counts.dead_letters ?? 0)),
+  };
+  return make(
+    "tr",
+    {},
+    name,
+    state,
     make("td", {}, `${member.host}, process ${member.pid}`),
     make("td", {}, make("code", {}, member.digest.slice(0, DIGITS))),
-    number("Revision", String(member.revision)),
-    number("Answered per second", perSecond === null ? "–" : perSecond.toFixed(perSecond < 10 ? 1 : 0)),
-    number("Answered", count("answered").toLocaleString()),
-    number("Failed", (count("failed") + count("dead_letters")).toLocaleString()),
-  ];
-  return make("tr", {}, name, ...cells);
+    ...Object.entries(numbers).map(([label, text]) => make("td", { class: "number", "data-label": label }, text)),
+  );
 }

@@ -1,9 +1,9 @@
-// Requests to the service, and its stream of events.
+// Requests to the service, its stream of events, and what all parts of the page are made with.
 
 const TOKEN = "epypes-token";
 const AGAIN_MS = 2000;
 
-/** What the service refused: a sentence, the status, and what came with it. */
+/** What the service refused: a sentence, the status (0 if there was no answer), and what came with it. */
 export class Refused extends Error {
   /** @param {number} status @param {Record<string, any>} data */
   constructor(status, data) {
@@ -23,7 +23,6 @@ export function takeToken() {
 /** Throws Refused if the service does not know the token. */
 export const isTokenKnown = () => ask("v1/access", "POST", {});
 
-/** @param {string} token */
 export function keepToken(token) {
   if (token) sessionStorage.setItem(TOKEN, token.trim());
   else sessionStorage.removeItem(TOKEN);
@@ -32,24 +31,26 @@ export function keepToken(token) {
 export const hasToken = () => sessionStorage.getItem(TOKEN) !== null;
 
 /**
+ * Ask for anything; throws Refused.
+ * @param {string} path @param {RequestInit} [options] @returns {Promise<Response>}
+ */
+export async function request(path, options = {}) {
+  const answer = await fetch(path, options).catch(() => {
+    throw new Refused(0, { detail: "The service can't be reached. Is it still running?" });
+  });
+  if (!answer.ok) throw new Refused(answer.status, await answer.json().catch(() => ({})));
+  return answer;
+}
+
+/**
  * Ask for JSON; throws Refused.
- * @param {string} path @param {string} [method] @param {unknown} [body]
- * @returns {Promise<any>}
+ * @param {string} path @param {string} [method] @param {unknown} [body] @returns {Promise<any>}
  */
 export async function ask(path, method = "GET", body = undefined) {
-  /** @type {Record<string, string>} */
   const headers = {};
   if (body !== undefined) headers["Content-Type"] = "application/json";
   if (method !== "GET" && hasToken()) headers.Authorization = `Bearer ${sessionStorage.getItem(TOKEN)}`;
-  let answer;
-  try {
-    answer = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
-  } catch {
-    throw new Refused(0, { detail: "The service can't be reached. Is it still running?" });
-  }
-  const data = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw new Refused(answer.status, data);
-  return data;
+  return (await request(path, { method, headers, body: JSON.stringify(body) })).json().catch(() => ({}));
 }
 
 /**
@@ -64,29 +65,26 @@ export function hear(on, onChange) {
     onChange(false);
     if (source.readyState === EventSource.CLOSED) setTimeout(() => hear(on, onChange), AGAIN_MS);
   };
-  for (const [kind, listener] of Object.entries(on)) {
-    source.addEventListener(kind, (event) => listener(JSON.parse(event.data)));
-  }
+  for (const [kind, listener] of Object.entries(on)) source.addEventListener(kind, (event) => listener(JSON.parse(event.data)));
 }
 
-/**
- * Make an element.
- * @param {string} tag @param {Record<string, string>} [attributes] @param {...(Node | string)} inside
- */
+/** Make an element. @returns {any} */
 export function make(tag, attributes = {}, ...inside) {
   const made = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, String(value));
   made.append(...inside);
   return made;
 }
 
-/** @param {string} id @returns {any} */
+/** Make the entries of a list of names and texts; those without a text are left out. */
+export function entries(facts) {
+  return Object.entries(facts).filter(([, text]) => text).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text)));
+}
+
+/** @returns {any} */
 export const part = (id) => document.getElementById(id);
 
-/**
- * Say something, or nothing, in a notice.
- * @param {string} id @param {string} text @param {boolean} [isError]
- */
+/** Say something, or nothing, in a notice. */
 export function say(id, text, isError = true) {
   const notice = part(id);
   notice.textContent = text;
@@ -94,27 +92,15 @@ export function say(id, text, isError = true) {
   notice.classList.toggle("error", isError);
 }
 
-/**
- * Ask the user; resolves to whether it is to be done.
- * @param {string} title @param {Node} body @param {string} yes
- * @returns {Promise<boolean>}
- */
-export function confirmed(title, body, yes) {
+/** Ask the user in a dialog, or only show something if there is nothing to answer; resolves to whether it is to be done. */
+export function confirmed(title, body, yes = "") {
   const dialog = part("ask");
   part("ask-title").textContent = title;
   part("ask-body").replaceChildren(body);
   part("ask-yes").textContent = yes;
   part("ask-yes").hidden = !yes;
   part("ask-no").textContent = yes ? "Cancel" : "Close";
+  dialog.returnValue = "";
   dialog.showModal();
-  return new Promise((resolve) => {
-    const end = (/** @type {boolean} */ wanted) => {
-      dialog.onclose = null;
-      dialog.close();
-      resolve(wanted);
-    };
-    part("ask-yes").onclick = () => end(true);
-    part("ask-no").onclick = () => end(false);
-    dialog.onclose = () => end(false);
-  });
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
 }

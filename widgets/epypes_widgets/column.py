@@ -12,8 +12,7 @@ from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 
 from epypes.graph import CompGraph
 from epypes.hints import Param
-from epypes_widgets.controls.control import Control
-from epypes_widgets.tooltips import tooltip
+from epypes_widgets.controls import Control
 from epypes_widgets.values import is_number, json_value, sendable
 
 
@@ -52,7 +51,7 @@ def column(cg: CompGraph, controls: Iterable[Control]) -> Column:
         for control in own:
             css = f"epypes-row-{len(rows)}"
             inside.append(ipywidgets.Box([control.widget], layout=layout, _dom_classes=("epypes-row", css)))
-            rows.append(_row(cg, control, css, function))
+            rows.append(_row(control, css, function))
         css = f"epypes-folder-{len(folders)}"
         boxes.append(ipywidgets.VBox(inside, layout=layout, _dom_classes=("epypes-folder", css)))
         folders.append({"css": css, "function": function})
@@ -68,9 +67,8 @@ def _by_function(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[s
             yield function, own
 
 
-def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, Any]:
+def _row(control: Control, css: str, function: str) -> dict[str, Any]:
     ranges = [param if isinstance(param, Param) else Param() for param in control.params]
-    values = control.read()
     is_movable = control.kind != "shown"
     return {
         "css": css,
@@ -85,9 +83,8 @@ def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, 
         "high": [_end(param.high) for param in ranges],
         "step": list(control.steps) or [None] * len(ranges),
         "default": [json_value(value) if is_movable else None for value in control.first],
-        "value": [json_value(values[name]) if is_movable else None for name in control.names],
         "unit": ranges[0].unit,
-        "tip": "\n".join(tooltip(cg, name, param) for name, param in zip(control.names, control.params, strict=True)),
+        "tip": control.tip,
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from epypes.display.previews.short import short_repr
@@ -109,22 +109,32 @@ class Scale:
         return low, high
 
 
-def scale(name: str, value: Any, param: Param) -> Scale | None:
+def scale_of(name: str, value: Any, param: Param) -> Scale | None:
     """Return the scale of a hyperparameter; None if there is nothing to be moved, or no slider could do it."""
     if param.choices is not None or not is_number(value) or not allows(param, _item(value)):
         return None
     whole = all(end is None or is_integer(end) for end in (param.low, param.high, param.step))
     integer = param.odd or (is_integer(value) and whole)
-    bottom, top = _hard_ends(param, value, integer)
-    ends = _offered(param, value, (bottom, top), integer)
-    if ends is None or (integer and max(map(abs, ends)) > _LAST_WHOLE):
+    least, greatest = _limits(value)
+    bottom, top = _inner(
+        least if param.low is None else max(param.low, least),
+        greatest if param.high is None else min(param.high, greatest),
+        integer,
+        param.odd,
+    )
+    for ends in filter(None, (param.soft, (bottom, top))):
+        low, high = _inner(max(ends[0], bottom), min(ends[1], top), integer, param.odd)
+        if _is_span(param, low, high):
+            break
+    else:
         return None
-    step = _step(param, *ends, integer)
-    found = Scale(name, param, value, integer, *ends, bottom, top, step)
+    if integer and max(abs(low), abs(high)) > _LAST_WHOLE:
+        return None
+    found = Scale(name, param, value, integer, low, high, bottom, top, _step(param, low, high, integer))
     if param.log:
         return found
-    grown = found.grown(*ends, value)
-    return Scale(name, param, value, integer, *grown, bottom, top, step)
+    low, high = found.grown(low, high, value)
+    return replace(found, low=low, high=high)
 
 
 def same_type(value: Any) -> Callable[[Any], Any]:
@@ -169,47 +179,18 @@ def _limits(value: Any) -> tuple[float, float]:
     return float(ends.min), float(ends.max)
 
 
-def _hard_ends(param: Param, value: Any, integer: bool) -> tuple[float, float]:
-    least, greatest = _limits(value)
-    low = least if param.low is None else max(param.low, least)
-    high = greatest if param.high is None else min(param.high, greatest)
-    if not integer:
-        return low, high
-    low = low if math.isinf(low) else math.ceil(low)
-    high = high if math.isinf(high) else math.floor(high)
-    return (low + (low % 2 == 0), high - (high % 2 == 0)) if param.odd else (low, high)
-
-
-def _offered(param: Param, value: Any, hard: tuple[float, float], integer: bool) -> tuple[float, float] | None:
-    """Return the ends to be offered, the soft ones if there are any; None if there is no span between them."""
-    for ends in filter(None, (param.soft, hard)):
-        low, high = _finite(*ends, value)
-        low, high = max(low, hard[0]), min(high, hard[1])
-        if param.odd:
-            low, high = math.ceil(low) | 1, (math.floor(high) - 1) | 1
-        elif integer:
-            low, high = math.ceil(low), math.floor(high)
-        if _is_span(param, low, high):
-            return low, high
-    return None
+def _inner(low: float, high: float, integer: bool, odd: bool) -> tuple[float, float]:
+    """Return the first and the last value between two ends that is of the kind of number."""
+    if integer:
+        low = low if math.isinf(low) else math.ceil(low)
+        high = high if math.isinf(high) else math.floor(high)
+    return (low + (low % 2 == 0), high - (high % 2 == 0)) if odd else (low, high)
 
 
 def _is_span(param: Param, low: float, high: float) -> bool:
     """Whether a slider can stand at several places between two ends."""
-    if param.log:
-        return exponent(low) < exponent(high)
-    return low < high and math.isfinite(float(high) - float(low))
-
-
-def _finite(low: float, high: float, value: Any) -> tuple[float, float]:
-    """Return ends of which the open ones are taken from the value: from 0 to three times it."""
-    plain = int(value) if is_integer(value) else float(value)
-    reach = 3 * abs(plain) or 10
-    if not is_number(low):
-        low = min(-reach if plain < 0 else 0, high - reach if is_number(high) else 0)
-    if not is_number(high):
-        high = max(reach, low + reach)
-    return low, high
+    is_finite = low < high and math.isfinite(float(high) - float(low))
+    return is_finite and (not param.log or exponent(low) < exponent(high))
 
 
 def _step(param: Param, low: float, high: float, integer: bool) -> float:

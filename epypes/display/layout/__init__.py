@@ -1,1 +1,0 @@
-"""The place of vertices and the way of edges, by Graphviz where it can."""
