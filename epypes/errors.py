@@ -233,19 +233,19 @@ class OutputArityError(EpypesError, ValueError):
 
 
 class StateChanged(EpypesError, RuntimeError):
-    """A function of a bundle changed an object that outlives the call; ``changed`` names the object."""
+    """A function of a bundle changed an object, or a setting, that outlives the call; ``changed`` names it."""
 
-    def __init__(self, function: str, changed: str, is_restored: bool) -> None:
+    def __init__(self, function: str, changed: str, is_restored: bool, *, is_setting: bool = False) -> None:
         self.function, self.changed, self.is_restored = function, changed, is_restored
         became = (
             "It has been put back, so that no later event depends on it"
             if is_restored
             else "It can't be put back, so that every later event fails until the bundle is loaded again"
         )
-        super().__init__(
-            f"Function {function!r} changed {changed!r}, which outlives the call. {became}. "
-            f"Change a copy of it. {keep_as_state(changed, is_object=not is_restored)}."
-        )
+        way_out = f"Change a copy of it. {keep_as_state(changed, is_object=not is_restored)}"
+        if is_setting:
+            way_out = "Have the function set it back before it returns, in a 'with' statement or in 'finally'"
+        super().__init__(f"Function {function!r} changed {changed!r}, which outlives the call. {became}. {way_out}.")
 
 
 class ContractBroken(EpypesError, ValueError):

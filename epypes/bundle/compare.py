@@ -20,8 +20,8 @@ from epypes.wording import counted
 
 # As Python and OpenCV write them; other text may hold numbers that look alike.
 _ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
-# Whose repr says all of it: it tells -0.0 from 0.0, and makes NaN agree with itself.
-_EXACT: Final = (bool, int, float, complex, str, bytes, bytearray, type(None))
+# Whose repr says all of it.
+_EXACT: Final = (bool, int, str, bytes, bytearray, type(None))
 # What is left where large numbers of an array cancel each other is a few of the last digits of those.
 FLOOR: Final = 16.0
 # The next run may be further off than the worst of a few; ten times that is far below any change of an algorithm.
@@ -168,7 +168,17 @@ def _parts(value: Any) -> list[tuple[str, Any]] | None:
 
 def _described(value: Any) -> str:
     """Return the repr of a value, of an object without its address."""
+    if type(value) in (float, complex):
+        return exact_text(value)
     return repr(value) if type(value) in _EXACT else _ADDRESS.sub(r"\g<1>0x", repr(value))
+
+
+def exact_text(number: complex) -> str:
+    """Return a number as a text that tells -0.0 from 0.0 and -NaN from NaN, and makes each agree with itself."""
+    if type(number) is complex and number != number:
+        return f"({exact_text(number.real)}, {exact_text(number.imag)})"
+    is_negative = type(number) is float and number != number and math.copysign(1.0, number) < 0
+    return f"-{number!r}" if is_negative else repr(number)
 
 
 def _in_objects(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Difference]:

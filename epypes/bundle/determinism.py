@@ -24,12 +24,13 @@ from typing import Final
 from epypes.bundle.adapters import ANSWER
 from epypes.bundle.compare import Difference, add_tolerances
 from epypes.bundle.file_access import named_here
-from epypes.bundle.libraries import WARNINGS, attributes_of, changed_attributes, is_of_texts, library_settings
+from epypes.bundle.libraries import attributes_of, changed_attributes
 from epypes.bundle.manifest import REQUIREMENTS, SAMPLES, SETTINGS, code_of, write_manifest
+from epypes.bundle.process_settings import WARNINGS, is_of_texts, library_settings
 from epypes.bundle.replay import ReplayReport
 from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated, without_python
 from epypes.bundle.settings import read_settings
-from epypes.bundle.side_effects import place_of_change
+from epypes.bundle.side_effects import places_of_change
 from epypes.errors import BundleError, PromotionRefused
 from epypes.optional import optional_import
 from epypes.wire.samples import read_sample, save_sample
@@ -176,7 +177,7 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         settings = _changed_settings(usual, draft)
         notes = [reason for name, reason in settings.items() if is_of_texts(name)]
         reasons = [reason for name, reason in settings.items() if not is_of_texts(name)]
-        reasons += [*_changed_libraries(usual, other, draft), *usual.changes]
+        reasons += _changed_libraries(usual, other, draft)
         if refused or usual.outside or not usual.tokens:
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
@@ -208,11 +209,13 @@ def _changed_settings(usual: ReplayReport, bundle: Path) -> dict[str, str]:
     here, nodes = library_settings(), [*ast.walk(ast.parse(code_of(bundle)))]
     catches = any(isinstance(node, ast.ExceptHandler) or getattr(node, "attr", "") == "suppress" for node in nodes)
     found: dict[str, str] = {}
+    places, calls = places_of_change()
     for name, default in usual.library_settings.items():
         value = here.get(name, default)
         if value != default and (name != WARNINGS or catches):
             setting, _, option = name.partition(" ")
-            here_is = ", ".join(filter(None, (place_of_change(option or setting, is_call=not option), value)))
+            place = places.get(option.rpartition(".")[2]) if option else calls.get(setting.rpartition(".")[2])
+            here_is = ", ".join(filter(None, (place, value)))
             found[name] = (
                 f"The notebook has changed {name} ({here_is}); a service has it as it is by default "
                 f"({default or 'not set'}). Change it inside the function that needs it, or set it back."
@@ -228,15 +231,16 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path) -
         for library, described in usual.libraries.items()
         if (others := other.libraries.get(library, described)) is not None
     }
-    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle))
+    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle), places_of_change()[0])
     # One change is found wherever a library has the object; the shortest of these names is the best known.
     distinct: dict[tuple[str, str, str], str] = {}
     for (library, name), both in sorted(changed.items(), key=lambda item: len(item[0][0])):
         distinct.setdefault((name, *both), library)
-    found = []
+    found, places = [], places_of_change()[0]
     for (name, value, default), library in distinct.items():
         here, there = (_DIGEST.sub("", text) for text in (value, default or "it is not there"))
-        here = ", ".join(filter(None, (place_of_change(name), here if here != there else "in its code or defaults")))
+        place = places.get(name.rpartition(".")[2])
+        here = ", ".join(filter(None, (place, here if here != there else "in its code or defaults")))
         found.append(
             f"The notebook has changed {library}.{name} ({here}); a service has it as it was installed ({there}). "
             "Undo that; call yours by a name of its own, or make the value a token."

@@ -55,6 +55,19 @@ from epypes.bundle.resolve import (
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
 
+# By these a function reads annotations or docstrings, which otherwise change nothing.
+_READS_ANNOTATIONS: Final = frozenset(
+    {
+        "__annotations__",
+        "__doc__",
+        "get_annotations",
+        "get_type_hints",
+        "getdoc",
+        "getfullargspec",
+        "signature",
+        "fields",
+    }
+)
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
     "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token. "
@@ -151,11 +164,17 @@ class _Walk:
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
         self._partners: tuple[dict[int, Any], dict[int, Any]] = {}, {}
         self._divided: dict[bool, _Different] = {}
-        self._asks_for_identity = self._asks_for_membership = False
+        self._asks_for_identity = self._asks_for_membership = self._asks_for_annotations = False
+        self._last: _Different | None = None  # raised if there is no other one
+        # The annotations and docstrings of pairs of objects, which count only where a function reads them.
+        self._annotations: list[tuple[_Path, dict[str, Any], dict[str, Any]]] = []
 
     def finish(self) -> None:
         """Compare all that is waiting and what it reaches; raise at the first difference."""
-        while self.waiting:
+        while self.waiting or (self._asks_for_annotations and self._annotations):
+            if not self.waiting:
+                self._add_all(*self._annotations.pop())
+                continue
             path, ours, theirs = self.waiting.popleft()
             ours, theirs = without_nodes(ours), without_nodes(theirs)
             if isinstance(theirs, str | PurePath) and type(ours) is type(theirs) and self._is_moved(ours, theirs):
@@ -167,6 +186,8 @@ class _Walk:
         for has_equals, difference in self._divided.items():
             if self._asks_for_identity or (self._asks_for_membership and not has_equals):
                 raise difference
+        if self._last is not None:
+            raise self._last
 
     def _is_moved(self, ours: Any, theirs: Any) -> bool:
         """Whether these are the name, or the path, of one module or of a file beside it, here and in the draft."""
@@ -206,6 +227,10 @@ class _Walk:
             ours.cache_clear()
         if mine[:2] != others[:2] or (mine.kind == "array" and not _is_laid_out_as(ours, theirs)):
             raise _unlike(path, ours, theirs)
+        has_nan = mine.kind in ("dict", "set", "frozenset") and any(map(_has_nan, ours))
+        if has_nan and [*map(id, ours)] != [*map(id, theirs)]:
+            text = f"{path.name} has a key that is NaN, which is found by its identity alone. Use None in its place."
+            self._last = self._last or _Different(path, text)
         left_out: tuple[str, ...] = (ANNOTATION,)
         if isinstance(ours, types.FunctionType) and ours.__code__ is not theirs.__code__:
             node = definition_of(ours.__code__)[1]
@@ -218,7 +243,9 @@ class _Walk:
             nodes = ours, theirs
             names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
-        self._add_all(path, _without(mine.parts, left_out), _without(others.parts, left_out))
+        parts, others_parts = dict(mine.parts), dict(others.parts)
+        self._add_all(path, _without(parts, left_out), _without(others_parts, left_out))
+        self._annotations.append((path, _annotations_in(parts), _annotations_in(others_parts)))
         if isinstance(ours, types.FunctionType) and not is_of_library(ours):
             read, others_read = ({f" {name!r}": part for name, part in module_reads(one)} for one in (ours, theirs))
             # Of a package, the notebook may have modules that no code of the bundle imports.
@@ -244,6 +271,7 @@ class _Walk:
         if node is None or other is None or not _is_same_text(ours.__code__, node, theirs.__code__, other):
             raise _Different(path, "the notebook has it with another text than the cells have now.")
         parts = [*ast.walk(node)]
+        self._asks_for_annotations |= not _READS_ANNOTATIONS.isdisjoint(_names(ours.__code__))
         self._asks_for_identity |= any(map(_asks_for_identity, parts))
         self._asks_for_membership |= any(isinstance(part, ast.In | ast.NotIn) for part in parts)
         # What an annotation names need not be there, and is not in the instructions where annotations are read late.
@@ -282,8 +310,19 @@ def _is_laid_out_as(ours: Any, theirs: Any) -> bool:
     return not is_whole or not ours.size or ours.strides == theirs.strides
 
 
-def _without(parts: Iterable[tuple[str, Any]], left_out: tuple[str, ...]) -> dict[str, Any]:
-    return {label: part for label, part in parts if not label.startswith(left_out)}
+def _without(parts: Mapping[str, Any], left_out: tuple[str, ...]) -> dict[str, Any]:
+    return {label: part for label, part in parts.items() if not label.startswith(left_out)}
+
+
+def _annotations_in(parts: Mapping[str, Any]) -> dict[str, Any]:
+    return {label: part for label, part in parts.items() if label.startswith(ANNOTATION)}
+
+
+def _has_nan(key: Any) -> bool:
+    """Whether a key of a dict or an element of a set is NaN, or a tuple with one."""
+    if type(key) in (tuple, frozenset):
+        return any(map(_has_nan, key))
+    return type(key) in ATOMS and key != key
 
 
 # -- functions -------------------------------------------------------------------------------------------------------

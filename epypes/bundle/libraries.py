@@ -1,13 +1,14 @@
-"""Libraries as one process has them: their settings, and what their modules hold, as texts to be compared.
+"""Libraries as one process has them: what their modules hold, as texts to be compared.
 
-A notebook may set a library otherwise or patch it in ways that no syntax shows: by a helper, through ``vars``, or deep
+A notebook may patch a library in ways that no syntax shows: by a helper, through ``vars``, or deep
 in another module. What it has changed is found by comparison with a process that has imported the same modules and
 nothing else. What differs between two such processes too, such as the time of an import, is no change.
 
 A number, text, tuple or array is described by its content; a function by its home, instructions and defaults; a class
-by its home, and by its attributes where it is defined; any other object by its type alone. Left out is what libraries
-count and remember in: private values, and names that are neither constants nor named by the bundle. So are modules that
-only one of the processes has loaded.
+by its home, and by its attributes where it is defined; any other object by its type alone. What libraries count and
+remember in, private values and names that are neither constants nor named by the bundle, counts only where the notebook
+may have changed it: its cells assign to such a name, or have it as a text. Modules that only one of the processes has
+loaded are left out.
 """
 
 from __future__ import annotations
@@ -15,118 +16,27 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
-import importlib
 import sys
 import types
-import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any, Final
 
-from epypes.bundle.resolve import evaluated
+from epypes.bundle.process_settings import OF_NOTEBOOKS
 from epypes.run.snapshot import is_own
 
 Attributes = Mapping[str, Mapping[str, str]]
 
-# Only where a function catches warnings, errors in their place change what it computes.
-WARNINGS: Final = "warnings.simplefilter"
 _ATOMS: Final = (int, float, complex, bool, str, bytes, type(None), type(...))
 # Longer descriptions are digests.
 _MOST_TEXT: Final = 60
 _MOST_ENTRIES: Final = 500
 _MOST_BYTES: Final = 65_536
 # They hold the interpreter's own state, which is another one in each kind of process.
-_OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
-# What these put into other modules, every notebook has.
-_OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
+OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
 # A name in modules that pytest has compiled otherwise, as it does with tests and plugins.
 _OF_PYTEST: Final = "@pytest_ar"
 _OWN: Final = ("__main__.", "unittest.mock.")
 _ALWAYS: Final = frozenset({"builtins", "numpy"})
-
-
-# -- settings --------------------------------------------------------------------------------------------------------
-
-
-def library_settings() -> dict[str, str]:
-    """Return how Python and libraries are set in this process, where that changes what functions compute."""
-    found: dict[str, str] = {}
-    with warnings.catch_warnings(action="ignore"):  # of options that are deprecated
-        for module, read in _SETTINGS:
-            if module in sys.modules:
-                found |= read(sys.modules[module])
-    return found
-
-
-def is_of_texts(setting: str) -> bool:
-    """Whether a setting changes nothing but how values are written as text."""
-    return setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
-
-
-def _of_warnings(warnings: Any) -> dict[str, str]:
-    kinds = [kind for action, _, kind, *_ in warnings.filters if action == "error"]
-    own = (kind for kind in kinds if isinstance(kind, type) and not kind.__module__.startswith(_OF_NOTEBOOKS))
-    return {WARNINGS: ", ".join(f"{kind.__name__} is an error" for kind in own)}
-
-
-def _of_numpy(numpy: Any) -> dict[str, str]:
-    raising = {error: way for error, way in numpy.geterr().items() if way not in ("ignore", "warn", "print", "log")}
-    return {
-        "numpy.seterr": f"{raising or 'no errors are raised'}",
-        "numpy.set_printoptions": f"{numpy.get_printoptions()}",
-    }
-
-
-def _of_decimal(decimal: Any) -> dict[str, str]:
-    context = decimal.getcontext()
-    parts = "prec", "rounding", "Emin", "Emax", "capitals", "clamp"
-    traps = sorted(signal.__name__ for signal, is_on in context.traps.items() if is_on)
-    text = ", ".join(f"{part}={getattr(context, part)}" for part in parts)
-    return {"decimal.getcontext": f"{text}, traps={' '.join(traps)}"}
-
-
-def _of_locale(locale: Any) -> dict[str, str]:
-    # All numbers, dates and orders of C.UTF-8 are those of C.
-    parts = {part: locale.setlocale(getattr(locale, part)) for part in ("LC_NUMERIC", "LC_TIME", "LC_COLLATE")}
-    others = (f"{part}={name}" for part, name in parts.items() if name.partition(".")[0] not in ("C", "POSIX"))
-    return {"locale.setlocale": ", ".join(others)}
-
-
-def _of_pandas(pandas: Any) -> dict[str, str]:
-    # Without what pandas sets by what shows it.
-    left_out = "display.encoding", "display.max_columns"
-    options = (option for option in _options(pandas.options) if option[0] not in left_out)
-    return {f"pandas.set_option {name}": f"{value!r}" for name, value in options}
-
-
-def _options(options: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name in dir(options):
-        value = getattr(options, name)
-        if type(value) is type(options):
-            yield from _options(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
-
-
-def _of_matplotlib(matplotlib: Any) -> dict[str, str]:
-    # Without what notebooks set themselves.
-    left_out = ("backend", "interactive")
-    parameters = {name: matplotlib.rcParams[name] for name in matplotlib.rcParams if not name.startswith(left_out)}
-    return {f"matplotlib.rcParams {name}": f"{value!r}" for name, value in parameters.items()}
-
-
-_SETTINGS: Final[tuple[tuple[str, Callable[[Any], dict[str, str]]], ...]] = (
-    ("warnings", _of_warnings),
-    ("numpy", _of_numpy),
-    ("decimal", _of_decimal),
-    ("locale", _of_locale),
-    ("cv2", lambda cv2: {"cv2.setUseOptimized": f"{cv2.useOptimized()}"}),
-    ("pandas", _of_pandas),
-    ("matplotlib", _of_matplotlib),
-)
-
-
-# -- what modules hold -----------------------------------------------------------------------------------------------
 
 
 def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes:
@@ -141,31 +51,9 @@ def library_attributes(named: Collection[str], new: Iterable[str]) -> Attributes
     """
     own = {name.partition(".")[0] for name in named}
     packages = own | _ALWAYS | ({name.partition(".")[0] for name in new} - sys.stdlib_module_names)
-    packages = {name for name in packages - _OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
+    packages = {name for name in packages - OF_THE_PROCESS if not name.startswith(("__", "epypes_"))}
     # The user's own modules are looked at by what the functions refer to.
     return attributes_of(name for name in [*sys.modules] if name.partition(".")[0] in packages and not is_own(name))
-
-
-def load_named(text: str, own: Collection[str] = ()) -> None:
-    """Load what a bundle names of libraries that load their parts when these are first asked for; none of its own."""
-    nodes, names = [*ast.walk(ast.parse(text))], {**sys.modules}
-    for node in nodes:
-        if not isinstance(node, ast.Import | ast.ImportFrom):
-            continue
-        for alias in node.names:
-            home = alias.name if isinstance(node, ast.Import) else "." * node.level + (node.module or "")
-            if home.partition(".")[0] in {"", *own}:
-                continue
-            with suppress(Exception):  # whatever a module raises that no sample has imported
-                if isinstance(node, ast.ImportFrom):
-                    source = importlib.import_module(node.module or "")
-                    names[alias.asname or alias.name] = getattr(source, alias.name)
-                else:
-                    names[alias.asname or alias.name] = importlib.import_module(alias.name)
-    for node in nodes:
-        if isinstance(node, ast.Attribute):
-            with suppress(Exception):
-                evaluated(node, names)
 
 
 def attributes_of(modules: Iterable[str]) -> Attributes:
@@ -174,10 +62,20 @@ def attributes_of(modules: Iterable[str]) -> Attributes:
     return {name: dict(_attributes(module, name)) for name, module in loaded.items() if _OF_PYTEST not in vars(module)}
 
 
-def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[tuple[str, str], tuple[str, str]]:
+def changed_attributes(
+    here: Attributes, there: Attributes, text: str, named_here: Collection[str]
+) -> dict[tuple[str, str], tuple[str, str]]:
     """Return by module and attribute what differs here from there, as the descriptions of both.
 
-    What is only here counts if a bundle's text names it; what was not yet computed there does not.
+    Parameters
+    ----------
+    here, there
+        What modules hold in two processes.
+    text
+        A bundle's code. What is only here counts if it names it.
+    named_here
+        The names that the notebook may have given another value. Private values, and those that are no constants and
+        not named by the bundle, are mostly what libraries count and remember: they count if they are among these.
     """
     mentioned = _mentioned(text)
     found: dict[tuple[str, str], tuple[str, str]] = {}
@@ -191,11 +89,12 @@ def changed_attributes(here: Attributes, there: Attributes, text: str) -> dict[t
                 is_lazy = value.startswith((f"{module.partition('.')[0]}.", "module "))
                 is_changed = last in mentioned and not is_lazy
             else:
-                is_changed = other not in ("None", value) and not value.startswith(_OF_NOTEBOOKS)
-                # Not what a loop over a set has left behind in a module.
-                is_changed &= last.isupper() or "." in name or last in mentioned or f".{last}" in other
-                # Nor what libraries do to each other.
+                # Not what a loop over a set has left behind in a module, nor what libraries do to each other.
+                is_changed = last.isupper() or "." in name or last in mentioned or f".{last}" in other
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
+                is_changed |= last in named_here
+                is_changed &= other != value and (other != "None" or last in named_here)
+                is_changed &= not value.startswith(OF_NOTEBOOKS)
             if is_changed:
                 found[module, name] = value, other
     return found
@@ -219,8 +118,6 @@ def _attributes(owner: Any, home: str, prefix: str = "") -> Iterator[tuple[str, 
     for name, value in [*vars(owner).items()]:
         is_function = isinstance(value, (type, *_FUNCTIONS)) or type(value) in _INNER
         if name.startswith("_repr_") or (name.startswith("__") and (not prefix or not is_function)):
-            continue
-        if name.startswith("_") and not is_function:
             continue
         yield f"{prefix}{name}", _described(value)
         if isinstance(value, type) and value.__module__ == home and value.__qualname__ == f"{prefix}{name}":

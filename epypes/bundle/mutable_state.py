@@ -3,7 +3,7 @@
 No answer may depend on an earlier event. Promotion refuses functions that plainly write to what outlives their call;
 syntax can't show all of it. So each function of a loaded bundle that refers to a mutable object is wrapped: after its
 call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged.
-Functions that refer only to constants, which are most, are not wrapped.
+For functions that refer only to constants, which are most, settings alone are compared, which takes some 2 us.
 
 Names and attributes are compared where some of the code can bind them, and locked arrays where some of it can unlock
 them; its instructions show that. To wrap every function and compare always takes 5 us per call: 27 % of an event of the
@@ -16,8 +16,13 @@ property has computed, a cache that is held elsewhere, and the attributes of a n
 count its calls. A function that reaches one of these never runs beside another one.
 
 A background model or a filter of OpenCV that outlives the call counts as changed. What a pipeline of the user's own
-class has in its attributes is not looked at. The global generators of ``random`` and ``numpy.random`` are not compared:
-a function may seed them for another one, and the replay finds draws without a seed.
+class has in its attributes is not looked at.
+
+How Python and libraries are set, and the variables of the context, are compared after each call of the user's
+functions. What a call sets in its context is gone with that; what else it has set is put back. What the code could
+patch in libraries is compared too: the attributes that its instructions store, or all of the modules and classes that
+it names where it stores by text, as ``vars`` and ``setattr`` do. The global random generators begin each event as they
+were when the bundle was loaded.
 
 Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.
@@ -31,15 +36,20 @@ from __future__ import annotations
 
 import dis
 import functools
+import itertools
 import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
+from enum import Enum
+from logging import Logger
 from typing import Any, Final
 
+from epypes.bundle.libraries import OF_THE_PROCESS
 from epypes.bundle.private_import import import_module, plain_name
+from epypes.bundle.process_settings import GlobalGenerators, ProcessSettings, is_setting
 from epypes.bundle.references import (
     cells_of,
     defaults_of,
@@ -54,7 +64,17 @@ from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.pipeline.node import wrap_calls
 from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
-from epypes.run.snapshot import Found, Record, Snapshot, array_record, as_dict, cached_properties, is_own, is_same
+from epypes.run.snapshot import (
+    Found,
+    Record,
+    Snapshot,
+    array_record,
+    as_dict,
+    cached_properties,
+    is_global_generator,
+    is_own,
+    is_same,
+)
 
 _CACHED: Final = type(functools.cache(len))
 # An attribute of an lru_cache: the one that takes its place.
@@ -80,6 +100,16 @@ _OF_PYTHON: Final = frozenset(
     | {"_value2member_map_", "__slotnames__"}
 )
 _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
+# How a logger logs changes no value, and depends on other loggers.
+_OF_A_LOGGER: Final = frozenset(vars(Logger("")))  # noqa: LOG001 - one that nobody uses
+# By these code binds names that its instructions don't say.
+_BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
+# Code with one of these names may draw from a generator of the whole process, unless it makes its own.
+_DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
+_OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
+# Py_TPFLAGS_HEAPTYPE: a class with this flag is no static one of C, which takes no attributes.
+_MADE_BY_PYTHON: Final = 1 << 9
+_SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
 
@@ -104,6 +134,8 @@ class CodeSnapshot(Snapshot):
         What puts back or forgets, after each call, what a call may change without a failure.
     nodes
         The nodes and pipelines that were met, by id.
+    has_code
+        Whether code of the user was met.
     """
 
     def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
@@ -112,16 +144,25 @@ class CodeSnapshot(Snapshot):
         self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
         self._code: set[str] = set()  # its names and instructions
+        self.has_code = False
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
+        # The modules, classes and functions of libraries that the code names.
+        self._of_libraries: dict[int, tuple[str, Any]] = {}
         super().__init__(functions)
         for needed, add in self._possible:
             if needed & self._code:
                 add()
         self._possible.clear()
+        self._compare_libraries()
 
     def __bool__(self) -> bool:
         return bool(self.records or self.resets or self._caches)
+
+    @property
+    def words(self) -> frozenset[str]:
+        """The names that the code has, and those of the libraries whose objects it names."""
+        return frozenset(self._code)
 
     def changed(self) -> str | None:
         """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
@@ -155,6 +196,12 @@ class CodeSnapshot(Snapshot):
     def look_at(self, name: str, value: Any) -> Found:
         """Look into code too."""
         kind = type(value)
+        home = value.__name__ if kind is types.ModuleType else getattr(value, "__module__", None)
+        if is_global_generator(getattr(value, "__self__", None)):
+            self._code.add("random")
+        if isinstance(home, str):
+            top = home.partition(".")[0]
+            self._code |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
         if kind is types.FunctionType:
             return self._look_at_function(value)
         if issubclass(kind, type):
@@ -178,6 +225,10 @@ class CodeSnapshot(Snapshot):
             lazy = cached_properties(kind)
             if lazy:
                 self.resets.append(functools.partial(_forget, value, lazy))
+            if issubclass(kind, Enum):
+                self._compare(_BINDS, functools.partial(_Bindings, f"{kind.__name__}.{value.name}.", value))
+        elif kind is Logger:
+            self.records.append(_Bindings(f"{name}.", value))
         elif is_model_of_cv2(value):
             self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
@@ -197,6 +248,7 @@ class CodeSnapshot(Snapshot):
     def _look_at_function(self, function: types.FunctionType) -> Found:
         known, code = function.__globals__, function.__code__
         if not is_own(str(known.get("__name__"))):
+            self._of_libraries[id(function)] = f"{function.__name__}.", function
             yield from _wrapped_by(function)
             return
         _check_caches(known)
@@ -221,8 +273,9 @@ class CodeSnapshot(Snapshot):
         yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
 
     def _note_instructions(self, code: types.CodeType) -> None:
-        """Note the names of some code, and the instructions by which it binds them."""
-        self._code.update(code.co_names)
+        """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
+        self.has_code = True
+        self._code.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
             if operation.startswith(("STORE_", "DELETE_")):
@@ -233,10 +286,14 @@ class CodeSnapshot(Snapshot):
         if is_own(str(kind.__module__)):
             yield from self._look_at_names(f"{kind.__name__}.", kind)
             yield from ((base.__name__, base) for base in kind.__bases__)
+        else:
+            self._of_libraries[id(kind)] = f"{kind.__name__}.", kind
 
     def _look_at_module(self, module: types.ModuleType) -> Found:
         if is_own(module.__name__):
             yield from self._look_at_names(f"{plain_name(module.__name__)}.", vars(module))
+        else:
+            self._of_libraries[id(module)] = f"{module.__name__}.", module
 
     def _look_at_names(self, prefix: str, owner: Any) -> Found:
         _check_caches(owner)
@@ -265,6 +322,24 @@ class CodeSnapshot(Snapshot):
             else:
                 self._caches.append((name, cached, values))
         yield name, cached.__wrapped__
+
+    def _compare_libraries(self) -> None:
+        """Compare what the code may bind in the libraries that it names: all of it, or what its instructions say."""
+        stored = frozenset(word.partition(" ")[2] for word in self._code if word[:10] in ("STORE_ATTR", "DELETE_ATT"))
+        names = None if _BINDS_BY_TEXT & self._code else stored
+        waiting = [*self._of_libraries.values()] if names is None or names else []
+        while waiting:
+            prefix, owner = waiting.pop()
+            if _can_be_patched(owner, names) and prefix.partition(".")[0] not in OF_THE_PROCESS:
+                self.records.append(_LibraryBindings(prefix, owner, names))
+            if isinstance(owner, types.ModuleType):
+                for name in self._code & vars(owner).keys():
+                    part = vars(owner)[name]
+                    is_new = id(part) not in self._of_libraries
+                    if is_new and isinstance(part, types.ModuleType | types.FunctionType | type):
+                        self._of_libraries[id(part)] = found = f"{prefix}{name}.", part
+                        waiting.append(found)
+        self._of_libraries.clear()
 
     def _compare(self, needed: frozenset[str], make: Callable[[], Record]) -> None:
         """Compare an object if the code has one of the names or instructions."""
@@ -323,11 +398,58 @@ class _Bindings(Record):
         ]
 
 
+class _LibraryBindings(_Bindings):
+    """The names of a library's module, or the attributes of its class or function: all, or those with some names.
+
+    What a library adds itself, such as a part that is loaded when it is first asked for, is no change.
+    """
+
+    __slots__ = ("names",)
+
+    def __init__(self, name: str, value: Any, names: frozenset[str] | None) -> None:
+        self.names = names
+        Record.__init__(self, name, value, self._read, self._write)
+
+    def _read(self, value: Any) -> tuple[Any, ...]:
+        found = _bound(value) if self.names is None else _some_bound(value, self.names)
+        return *found, *found.values()
+
+    def _others(self, now: tuple[Any, ...]) -> list[str]:
+        before, after = as_dict(self.saved), as_dict(now)
+        return [name for name in super()._others(now) if name in before or not _is_of_library(after[name])]
+
+    def _write(self, value: Any, saved: tuple[Any, ...]) -> None:
+        before, now = as_dict(saved), as_dict(self._read(value))
+        for name in self._others((*now, *now.values())):
+            if name in before:
+                setattr(value, name, before[name])
+            else:
+                delattr(value, name)
+
+
+def _can_be_patched(owner: Any, names: frozenset[str] | None) -> bool:
+    """Whether attributes with some names, all without, can be set of a library's module, class or function."""
+    if isinstance(owner, type):
+        return bool(owner.__flags__ & _MADE_BY_PYTHON)
+    return names is None or isinstance(owner, types.ModuleType) or not names.isdisjoint(_PARTS_OF_A_FUNCTION)
+
+
+def _is_of_library(value: Any) -> bool:
+    """Whether a value is a module, class or function that is not the user's."""
+    is_code = isinstance(value, types.ModuleType | types.FunctionType | types.BuiltinFunctionType | type)
+    return is_code and not is_own(str(getattr(value, "__module__", None) or getattr(value, "__name__", "")))
+
+
+def _some_bound(value: Any, names: frozenset[str]) -> dict[str, Any]:
+    known, parts = vars(value), names.intersection(_PARTS_OF_A_FUNCTION) if type(value) is types.FunctionType else ()
+    return {name: known[name] for name in names & known.keys()} | {name: getattr(value, name) for name in parts}
+
+
 def _bound(value: Any) -> dict[str, Any]:
     """Return the names of a module, or the attributes of an object that are the user's."""
     if type(value) is dict:
         return value
-    skipped = _OF_A_NODE if isinstance(value, Node) else _OF_PYTHON
+    skipped = _OF_A_NODE if isinstance(value, Node) else _OF_A_LOGGER if type(value) is Logger else _OF_PYTHON
     found = {name: part for name, part in vars(value).items() if name not in skipped and name[:9] != "__epypes_"}
     if type(value) is types.FunctionType:
         found |= {name: getattr(value, name) for name in _PARTS_OF_A_FUNCTION}
@@ -423,7 +545,7 @@ class MutableState:
     """
 
     def __init__(self, functions: Mapping[str, Callable[..., Any]], hyperparameters: Mapping[str, Any]) -> None:
-        self._lock = _ReadersWriterLock()
+        self._lock, self._settings, self._generators = _ReadersWriterLock(), ProcessSettings(), GlobalGenerators()
         self._shared = {
             f"hyperparameter {token}": value for token, value in hyperparameters.items() if _has_containers(value)
         }
@@ -450,9 +572,11 @@ class MutableState:
             return function
         function = _checked(function)
         snapshot = CodeSnapshot({**self._shared, name: function}, self._compared)
-        if not snapshot:
+        self._settings.add(snapshot.words)
+        is_of_user = snapshot.has_code or bool(snapshot)
+        if not is_of_user and not self._settings.is_set_by(function):
             return function
-        if type(function) in (types.FunctionType, functools.partial, _CACHED):
+        if is_of_user and type(function) in (types.FunctionType, functools.partial, _CACHED):
             # It stays what the module defines, so that it can be promoted again.
             setattr(function, WATCH, functools.partial(self._guarded_call, function=function, snapshot=snapshot))
             self._refer_to(snapshot.nodes)
@@ -472,17 +596,10 @@ class MutableState:
     def _guarded_call(
         self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
     ) -> Callable[..., Any]:
-        lock, referred = self._lock, self._referred
-
-        def attempt(args: Any, kwargs: Any) -> tuple[Any, BaseException | None]:
-            token = _held.set(lock)
-            try:
-                return function(*args, **kwargs), None
-            except BaseException as error:
-                return None, error
-            finally:
-                _held.reset(token)
-                snapshot.reset()
+        lock, referred, settings = self._lock, self._referred, self._settings
+        draws = not snapshot.words.isdisjoint(_DRAWS) and snapshot.words.isdisjoint(_OWN_GENERATORS)
+        has_resets = draws or bool(snapshot.resets)
+        attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -490,32 +607,38 @@ class MutableState:
             ticket = lock.acquire_read(only_if_free=id(node) in referred) if _held.get() is not lock else None
             if ticket is None:
                 return function(*args, **kwargs)
-            is_exclusive, is_restored = bool(snapshot.resets), True
+            is_exclusive, is_restored, token = has_resets, True, _held.set(lock)
             try:
                 if is_exclusive:
                     lock.upgrade(ticket)
                     if snapshot.changed() is not None:  # by a call that waits to put it back
                         snapshot.restored()
-                result, error = attempt(args, kwargs)
-                changed = snapshot.changed()
-                if changed is not None and not is_exclusive:
-                    is_exclusive = True
-                    if not lock.upgrade(ticket):
-                        snapshot.restored()
-                        result, error = attempt(args, kwargs)
-                        changed = snapshot.changed()
+                    if draws:
+                        self._generators.begin(name)
+                result, error, changed = attempt(args, kwargs)
                 if changed is not None:
-                    is_restored = snapshot.restored()
+                    was_alone = is_exclusive or lock.upgrade(ticket)
+                    is_exclusive = True
+                    if not was_alone or not settings.is_known():
+                        found, first = settings.now(), (result, error)
+                        snapshot.restored()
+                        settings.restored()
+                        result, error, changed = attempt(args, kwargs)
+                        if was_alone and changed is None:  # they were set between two calls
+                            settings.set_to(found)
+                            result, error = first
+                        del first
+                    is_restored = changed is None or snapshot.restored() & settings.restored()
             finally:
-                lock.release(is_exclusive)
+                _held.reset(token)
+                lock.release(ticket, is_exclusive)
             try:
                 if error is not None:
                     raise error
-                if changed is not None:
-                    raise StateChanged(name, changed, is_restored)
+                if changed:
+                    raise StateChanged(name, changed, is_restored, is_setting=is_setting(changed))
                 return result
             finally:
-                # The exception refers to this frame, which refers to the exception, and to the images of the call.
                 del error, result
 
         vars(call).pop(WATCH, None)
@@ -523,52 +646,84 @@ class MutableState:
         return call
 
 
+_Outcome = tuple[Any, BaseException | None, str | None]
+
+
+def _attempt(
+    function: Callable[..., Any], snapshot: CodeSnapshot | None, settings: ProcessSettings, args: Any, kwargs: Any
+) -> _Outcome:
+    """Call a function; return its result, what it has raised, and what it has changed that outlives the call."""
+    # What the call sets in the context is gone with that.
+    context, modules, error = copy_context(), len(sys.modules), None
+    try:
+        result = context.run(function, *args, **kwargs)
+    except BaseException as raised:
+        result, error = None, raised
+    changed = None
+    if snapshot is not None:
+        snapshot.reset()
+        changed = snapshot.changed()
+    try:
+        return result, error, settings.changed(context, modules) if changed is None else changed
+    finally:
+        # The exception refers to this frame, which refers to the exception, and to the images of the call.
+        del error, result
+
+
 class _ReadersWriterLock:
     """A lock that calls share as readers, each of which may become the writer, which has the objects alone.
 
     Readers that wait to become the writer count as ended, so they don't wait for one another. No reader begins then.
+    To begin and to end as a reader takes no lock: the dict of those that run is changed in one step each time.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.Lock())
-        # Readers that are running; those that are, or wait to become, the writer; readers begun so far.
-        self._running = self._writers = self._begun = 0
+        # The readers that are running, by number; how many are, or wait to become, the writer; the number begun last.
+        self._running: dict[int, bool] = {}
+        self._writers = self._begun = 0
+        self._numbers = itertools.count(1)
 
     def acquire_read(self, *, only_if_free: bool = False) -> int | None:
-        """Begin as a reader; return a ticket for ``upgrade``: 0 if others are running.
+        """Begin as a reader; return a ticket for ``upgrade`` and ``release``: a negative one if others are running.
 
         With ``only_if_free`` nothing is acquired, and None is returned, where others are running.
         """
-        with self._changed:
+        while True:
             if only_if_free and (self._running or self._writers):
                 return None
-            while self._writers:
-                self._changed.wait()
-            self._running += 1
-            self._begun += 1
-            return self._begun if self._running == 1 else 0
+            number = next(self._numbers)
+            self._running[number] = True
+            self._begun = number
+            if not self._writers:
+                return number if len(self._running) == 1 else -number
+            with self._changed:
+                del self._running[number]
+                self._changed.notify_all()
+                while self._writers:
+                    self._changed.wait()
 
     def upgrade(self, ticket: int) -> bool:
         """Become the writer when all other readers have ended; return whether none ran since the ticket was given."""
         with self._changed:
             was_alone = ticket == self._begun
             self._writers += 1
-            self._running -= 1
+            del self._running[abs(ticket)]
             self._changed.notify_all()
             try:
                 while self._running:
                     self._changed.wait()
             finally:
-                self._running += 1
+                self._running[abs(ticket)] = True
             return was_alone
 
-    def release(self, is_writer: bool) -> None:
+    def release(self, ticket: int, is_writer: bool) -> None:
         """End as a reader or as the writer."""
-        with self._changed:
-            self._running -= 1
-            if self._writers:
+        del self._running[abs(ticket)]
+        if self._writers:
+            with self._changed:
+                self._writers -= is_writer
                 self._changed.notify_all()
-            self._writers -= is_writer
 
 
 def _has_containers(value: Any) -> bool:

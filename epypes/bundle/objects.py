@@ -27,6 +27,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
+from epypes.bundle.compare import exact_text
 from epypes.bundle.expressions import has_steady_order
 from epypes.bundle.private_import import import_module, loaded_module, plain_name
 from epypes.bundle.references import defaults_of, global_names, imported_modules, meanings_of, nested_codes
@@ -122,6 +123,8 @@ def atom_content(value: Any) -> str | bytes:
     """Return a number or text exactly."""
     if type(value) in (str, bytes):
         return cast("str | bytes", value)
+    if type(value) in (float, complex):
+        return exact_text(value)
     # Python refuses to write very long numbers as decimals.
     return hex(value) if type(value) is int else repr(value)
 
@@ -234,6 +237,7 @@ def _module(module: types.ModuleType) -> Description:
 def _class(kind: type) -> Description:
     left_out = {*_OF_EVERY_CLASS}
     parts: list[tuple[str, Any]] = [(" metaclass", type(kind)), (" bases", kind.__bases__), *_annotations(kind)]
+    parts.append((f"{ANNOTATION}its docstring", kind.__doc__))
     if "__dataclass_params__" in vars(kind):
         parts.append((" options", repr(vars(kind)["__dataclass_params__"])))
     if isinstance(kind, enum.EnumMeta):

@@ -53,8 +53,6 @@ class ReplayReport:
         How libraries were set that the replay imported.
     libraries
         What their modules hold, by module and attribute, if that was asked for.
-    changes
-        What the functions have changed in libraries, as sentences.
     fingerprints
         Digests of the functions and of what they refer to, as the import of the module made them.
     """
@@ -69,7 +67,6 @@ class ReplayReport:
     outside: Sequence[str] = ()
     library_settings: Mapping[str, str] = field(default_factory=dict)
     libraries: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    changes: Sequence[str] = ()
     fingerprints: Mapping[str, str] = field(default_factory=dict)
 
     @property

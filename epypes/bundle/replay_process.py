@@ -6,7 +6,9 @@ it records the samples anew instead.
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import importlib
 import inspect
 import json
 import os
@@ -25,7 +27,7 @@ from typing import Any, Final
 from epypes.bundle.compare import Difference, differences
 from epypes.bundle.file_access import FileAccess
 from epypes.bundle.fingerprint import Digester
-from epypes.bundle.libraries import changed_attributes, library_attributes, library_settings, load_named
+from epypes.bundle.libraries import library_attributes
 from epypes.bundle.load import MODULES_OF_A_BUNDLE, WITH_DELAYS, Bundle, read_bundle
 from epypes.bundle.manifest import (
     REQUIREMENTS,
@@ -37,8 +39,10 @@ from epypes.bundle.manifest import (
     own_packages,
     recorded_environment,
 )
+from epypes.bundle.process_settings import GlobalGenerators, library_settings
 from epypes.bundle.replay import ReplayReport, record_again, replay
 from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
+from epypes.bundle.resolve import evaluated
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.run.guard import as_written
 from epypes.wire.samples import read_sample
@@ -59,10 +63,6 @@ _TOO_LONG: Final = (
 _DIED: Final = (
     "Memory has run out, or a library has crashed: run the functions in a new process, and give smaller samples if "
     "memory has."
-)
-_OUTLIVES: Final = (
-    "while it runs, which outlives the call: the next event would find it different. Keep it in a variable of the "
-    "function, or make it a token."
 )
 
 
@@ -87,7 +87,7 @@ def replay_isolated(
     record
         Whether the samples are recorded anew, and nothing is compared.
     with_libraries
-        Whether the report says what the modules of libraries hold, and what the functions have changed in them.
+        Whether the report says what the modules of libraries hold.
     timeout_s
         When the process is ended.
     python
@@ -136,6 +136,7 @@ def without_python() -> dict[str, str]:
 def main(arguments: Sequence[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
+    GlobalGenerators.are_put_back = False
     try:
         if "--record" in arguments:
             report = record_again(read_bundle(folder, compare=False))
@@ -164,27 +165,42 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
     bundle = read_bundle(folder, compare=False)
     access.note_names(bundle.settings.hyperparameters)
     fingerprints, named = _fingerprints(bundle), imported_names(text, own)
-    trace = sys.gettrace()
-    sys.settrace(None)  # which would make this many times slower
-    as_loaded = library_attributes(named, sys.modules.keys() - before) if with_libraries else {}
-    sys.settrace(trace)
     report = replay(bundle, twice=True, on_run=access.begin_run)
     sys.settrace(None)
     new = sys.modules.keys() - before
     if with_libraries:
-        load_named(text, own)
-    libraries = library_attributes(named, new) if with_libraries else {}
-    changed = changed_attributes(libraries, as_loaded, text)
+        _load_named(text, own)
     return replace(
         report,
         outside=access.files,
         requirements=requirement_lines(named | new),
-        libraries=libraries,
-        changes=[f"A function changes {module}.{name} {_OUTLIVES}" for module, name in changed],
+        libraries=library_attributes(named, new) if with_libraries else {},
         notes=_unproved_lines(ran, folder),
         library_settings=library_settings(),
         fingerprints=fingerprints,
     )
+
+
+def _load_named(text: str, own: Collection[str]) -> None:
+    """Load what a bundle names of libraries that load their parts when these are first asked for; none of its own."""
+    nodes, names = [*ast.walk(ast.parse(text))], {**sys.modules}
+    for node in nodes:
+        if not isinstance(node, ast.Import | ast.ImportFrom):
+            continue
+        for alias in node.names:
+            home = alias.name if isinstance(node, ast.Import) else "." * node.level + (node.module or "")
+            if home.partition(".")[0] in {"", *own}:
+                continue
+            with contextlib.suppress(Exception):  # whatever a module raises that no sample has imported
+                if isinstance(node, ast.ImportFrom):
+                    source = importlib.import_module(node.module or "")
+                    names[alias.asname or alias.name] = getattr(source, alias.name)
+                else:
+                    names[alias.asname or alias.name] = importlib.import_module(alias.name)
+    for node in nodes:
+        if isinstance(node, ast.Attribute):
+            with contextlib.suppress(Exception):
+                evaluated(node, names)
 
 
 def _fingerprints(bundle: Bundle) -> dict[str, str]:

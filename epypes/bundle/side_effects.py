@@ -287,27 +287,24 @@ def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str
                 yield builtins, read.id
 
 
-def place_of_change(name: str, *, is_call: bool = False) -> str:
-    """Return the last place in the cells that may have changed an attribute of a library, by its name; "" if none.
+def places_of_change() -> tuple[dict[str, str], dict[str, str]]:
+    """Return the last places in the cells that may have changed attributes of libraries, and that call functions.
 
-    That is an assignment to it, or a text or keyword that names it; or a call of it if ``is_call``.
+    The first are by the names of attributes, to which something is assigned or which a text or keyword names; the
+    second by the names of the functions.
     """
-    last, found = name.rpartition(".")[2], ""
+    named: dict[str, str] = {}
+    called: dict[str, str] = {}
     for cell, text in _cells():
         tree = parsed(text)
         nodes: list[Any] = [*ast.walk(tree)] if tree else []
         read = {id(node.slice) for node in nodes if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)}
-        calls = (node for node in nodes if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "getattr")
-        read |= {id(argument) for call in calls for argument in call.args}
-        lines = [node.lineno for node in nodes if id(node) not in read and _may_change(node, last, is_call=is_call)]
-        found = f"{cell}, line {lines[-1]}" if lines else found
-    return found
-
-
-def _may_change(node: Any, name: str, *, is_call: bool) -> bool:
-    if is_call:
-        return isinstance(node, ast.Call) and getattr(node.func, "attr", "") == name
-    if isinstance(node, ast.Attribute):
-        return node.attr == name and not isinstance(node.ctx, ast.Load)
-    text = node.arg if isinstance(node, ast.keyword) else getattr(node, "value", None)
-    return isinstance(text, str) and text.rpartition(".")[2] == name
+        calls = [node for node in nodes if isinstance(node, ast.Call)]
+        read |= {id(argument) for call in calls if getattr(call.func, "id", "") == "getattr" for argument in call.args}
+        called |= {getattr(call.func, "attr", ""): f"{cell}, line {call.lineno}" for call in calls}
+        for node in nodes:
+            is_written = isinstance(node, ast.Attribute) and not isinstance(node.ctx, ast.Load)
+            name = getattr(node, "attr" if is_written else "arg" if isinstance(node, ast.keyword) else "value", None)
+            if isinstance(name, str) and id(node) not in read:
+                named[name.rpartition(".")[2]] = f"{cell}, line {node.lineno}"
+    return named, called

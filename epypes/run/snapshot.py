@@ -160,7 +160,7 @@ class Snapshot:
     def look_at(self, name: str, value: Any) -> Found:
         """Record one object as far as it can change, and give what it refers to; the hook for subclasses."""
         kind = type(value)
-        if issubclass(kind, _CONSTANT) or issubclass(kind, _CODE) or _is_global_generator(value):
+        if issubclass(kind, _CONSTANT) or issubclass(kind, _CODE) or is_global_generator(value):
             return
         if is_array(value):
             yield from self.look_at_array(name, value)
@@ -429,7 +429,7 @@ def _ways_to(names: Sequence[str]) -> _Way:
     return operator.attrgetter(*names), write
 
 
-def _is_global_generator(value: Any) -> bool:
+def is_global_generator(value: Any) -> bool:
     """Whether this is the generator behind the functions of ``random`` or ``numpy.random``."""
     numbers = sys.modules.get("numpy.random")
     return value is random._inst or (numbers is not None and value is numbers.mtrand._rand)

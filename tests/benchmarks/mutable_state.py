@@ -1,7 +1,8 @@
 """What does it cost that a bundle's functions are watched for changes of what outlives a call?
 
-The limit is the same bundle with its functions as they are. The first two reach nothing that can change, as most do: they
-are not wrapped. In the third every function reads constants in lists, dicts, objects and caches.
+The limit is the same bundle with its functions as they are. The first two reach nothing that can change, as most do: of
+them the settings of the process alone are compared. In the third every function reads constants in lists, dicts, objects
+and caches.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ DEPENDS = {
         "the time zone (TZ)",
     ),
     "the locale": (
-        "import locale\ndef use(x):\n    locale.setlocale(locale.LC_ALL, '')\n"
-        "    return str(locale.getlocale()) + locale.format_string('%.2f', x[0], grouping=True)",
+        "import locale\ndef use(x):\n    before = locale.setlocale(locale.LC_ALL)\n    locale.setlocale(locale.LC_ALL, '')\n"
+        "    found = str(locale.getlocale()) + locale.format_string('%.2f', x[0], grouping=True)\n"
+        "    locale.setlocale(locale.LC_ALL, before)\n    return found",
         "the locale (LC_ALL)",
     ),
     "the parts of a sum": (
@@ -120,14 +121,26 @@ def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_
     "source",
     [
         # Neither the text nor the snapshot of mutable objects shows it, and in the notebook it is constant by now.
-        "import numpy as np\ndef use(x):\n    return np.seterr(all='ignore')['over']",
-        "import sys\ndef use(x):\n    before = sys.getrecursionlimit()\n    sys.setrecursionlimit(1500)\n    return before",
+        "import threading\ndef use(x):\n    return threading.stack_size(1 << 24)",
+        "import gc\ndef use(x):\n    before = gc.get_threshold()[0]\n    gc.set_threshold(1500)\n    return before",
     ],
 )
 def test_a_function_that_keeps_something_from_call_to_call_is_refused(source, tmp_path):
     text = refusal(source, tmp_path / "bundle")
     assert "token 'used_0': " in text
     assert "It depends on when, how often and in which order function 'use_0' is called" in text
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        # A bundle puts these back after each call, so that they are what they were before the notebook's first run.
+        "import numpy as np\ndef use(x):\n    return np.seterr(all='ignore')['over']",
+        "import sys\ndef use(x):\n    before = sys.getrecursionlimit()\n    sys.setrecursionlimit(1500)\n    return before",
+    ],
+)
+def test_a_function_that_reads_a_setting_which_it_has_left_is_refused(source, tmp_path):
+    assert "token 'used_0': " in refusal(source, tmp_path / "bundle")
 
 
 def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):

@@ -230,6 +230,20 @@ REFUSED: dict[str, tuple[str, str]] = {
         "class C:\n    T = {float('nan'): 1, float('nan'): 2}\nC.T[[*C.T][0]] = 5\ndef f(a):\n    return a * [*C.T.values()][0]",
         r"Class 'C' .* its 'T' values\[0\] is 5 in the notebook and 1",
     ),
+    "NaN as a key": (
+        "N = float('nan')\nD = {N: 2}\ndef f(a):\n    return a * (D[N] if a.max() > 100 else 1)", "its 'D' has a key that is NaN, which is found by its identity",
+    ),
+    "NaN with a sign": (
+        "import math\nN = -float('nan')\ndef f(a):\n    return a * (math.copysign(1, N) if a.max() > 100 else 1)", "its 'N' is nan in the notebook and nan in the module|its 'N' is something else",
+    ),
+    "docstring of a class that is read as data": (
+        "class C:\n    'One.'\nC.__doc__ = 'Other.'\ndef f(a):\n    return a * (len(C.__doc__) if a.max() > 100 else 1)",
+        "its docstring is 'Other.' in the notebook and 'One.' in the module",
+    ),
+    "annotation that is read as data": (
+        "K = 2\ndef g(a: K):\n    return a\nK = 5\ndef f(a):\n    return g(a) * (g.__annotations__['a'] if a.max() > 100 else 1)",
+        "its annotation of 'a' is .* in the notebook and 5 in the module",
+    ),
     "runner of a class": (
         "import epypes as ep\nclass C:\n    R = ep.CompGraphRunner(ep.CompGraph({'g': abs}, {'g': ('x', 'y')}))\nC.R.run(x=3)\n"
         "def f(a):\n    return a * C.R.rerun()['y']",

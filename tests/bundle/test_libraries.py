@@ -41,13 +41,14 @@ def put_back():
     """Put the attributes of libraries back that a test changes."""
     import colorsys
     import fractions
+    import string
     import textwrap
 
     from skimage.filters import gaussian, thresholding
 
     attributes = [
         (cv2, "INTER_AREA"), (cv2, "INTER_CUBIC"), (cv2, "INTER_LINEAR"), (np, "median"), (thresholding, "histogram"), (fractions.Fraction, "limit_denominator"),
-        (textwrap.indent, "__defaults__"), (colorsys, "ONE_THIRD"), (gaussian, "__code__"), (gaussian, "__kwdefaults__"),
+        (textwrap.indent, "__defaults__"), (colorsys, "ONE_THIRD"), (textwrap, "_whitespace"), (string, "whitespace"), (gaussian, "__code__"), (gaussian, "__kwdefaults__"),
     ]  # fmt: skip
     values = [(owner, name, getattr(owner, name)) for owner, name in attributes]
     try:
@@ -107,6 +108,16 @@ PATCHES = {
         "gaussian(x)",
         "gaussian (",
     ),
+    "a private constant": (
+        "def hide(module, **values):\n    vars(module).update(values)\nhide(textwrap, _whitespace='a')",
+        "textwrap.wrap('a b')",
+        "The notebook has changed textwrap._whitespace (cell [N], line 3, 'a');",
+    ),
+    "a constant in lower case that the bundle does not name": (
+        "import string\nsetattr(string, 'whitespace', '_')",
+        "string.capwords('a b')",
+        "string.whitespace (cell [N], line 2, '_')",
+    ),
     "a new attribute": (
         "def add(module, **values):\n    vars(module).update(values)\nadd(np, gain_of_here=3)",
         "getattr(np, 'gain_of_here', 1)",
@@ -138,7 +149,7 @@ def test_a_function_that_keeps_something_in_a_library_is_refused(monkeypatch, tm
     )
     with put_back():
         text = refusal(monkeypatch, tmp_path, source)
-    assert "A function changes numpy.n_calls while it runs, which outlives the call" in text
+    assert "Function 'use' changed 'numpy.n_calls', which outlives the call" in text
 
 
 # By name: a cell that changes a setting, and what is computed on a branch.

@@ -6,8 +6,10 @@ import queue
 import sys
 import textwrap
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 
@@ -139,6 +141,90 @@ KEPT = {
     ),
 }  # fmt: skip
 
+# By name: what a function does above 100, and what of the process it answers with. Each must fail by the name.
+SETTINGS_OF_THE_PROCESS = {
+    "numpy.seterr": ("np.seterr(all='raise')", "np.geterr()"),
+    "numpy.seterr ": ("getattr(np, 'set' + 'err')(divide='raise')", "np.geterr()"),
+    "numpy.set_printoptions": ("np.set_printoptions(precision=2)", "np.get_printoptions()['precision']"),
+    "sys.set_int_max_str_digits": ("sys.set_int_max_str_digits(5432)", "sys.get_int_max_str_digits()"),
+    "cv2.setUseOptimized": ("cv2.setUseOptimized(not cv2.useOptimized())", "cv2.useOptimized()"),
+    "locale.setlocale": ("locale.setlocale(locale.LC_CTYPE, 'C')", "locale.setlocale(locale.LC_CTYPE)"),
+    "warnings.simplefilter": ("warnings.simplefilter('error')", "[*warnings.filters]"),
+    "warnings.simplefilter ": ("warnings.filters.insert(0, ('error', None, OSError, None, 0))", "[*warnings.filters]"),
+    "decimal.getcontext": ("decimal.getcontext().prec = 3", "decimal.Decimal(1) / 3"),
+    "decimal.getcontext ": ("decimal.getcontext().traps[decimal.Inexact] = True", "dict(decimal.getcontext().traps)"),
+    "os.environ": ("os.environ['EPYPES_TEST'] = '1'", "os.environ.get('EPYPES_TEST')"),
+    "os.environ ": ("os.environ.pop('HOME', None)", "os.environ.get('HOME')"),
+    "os.chdir": ("os.chdir('/')", "os.getcwd()"),
+    "os.chdir ": ("go('/')", "os.getcwd()"),
+    "ContextVar gain": ("GAIN.set(2)", "GAIN.get()"),
+    "ContextVar kernel": ("KERNEL.set(np.ones(3))", "KERNEL.get()"),
+    "pandas.set_option": ("pd.set_option('display.precision', 2)", "pd.get_option('display.precision')"),
+    "matplotlib.rcParams": ("matplotlib.rcParams['image.cmap'] = 'gray'", "matplotlib.rcParams['image.cmap']"),
+}  # fmt: skip
+# What no function computes anything else with: it is put back without a failure.
+QUIET_SETTINGS = {
+    "numpy.seterr": ("np.seterr(all='ignore')", "np.geterr()"),
+    "sys.setrecursionlimit": ("sys.setrecursionlimit(5432)", "sys.getrecursionlimit()"),
+    "cv2.setNumThreads": ("cv2.setNumThreads(cv2.getNumThreads() + 1)", "cv2.getNumThreads()"),
+    "warnings.simplefilter": ("warnings.simplefilter('ignore')", "[*warnings.filters]"),
+}
+IMPORTS_OF_SETTINGS = (
+    "import contextvars, decimal, locale, os, sys, warnings\nimport cv2, matplotlib\nimport pandas as pd\nfrom os import chdir as go\n"
+    "GAIN, KERNEL = contextvars.ContextVar('gain', default=1), contextvars.ContextVar('kernel')\nKERNEL.set(np.zeros(3))\n"
+)
+
+# By name: a module whose function, which is not a plain one, changes a setting above 100.
+SETTERS = {
+    "partial": "def g(k, x):\n    if x > 100: np.seterr(all='raise')\n    return np.geterr()\nf = functools.partial(g, 3)",
+    "cache": "@functools.cache\ndef f(x):\n    if x > 100: np.seterr(all='raise')\n    return np.geterr()",
+    "vectorized": "f = np.vectorize(lambda x: np.seterr(all='raise' if x > 100 else None)['over'])",
+    "object": "class C:\n    def __call__(self, x):\n        if x > 100: np.seterr(all='raise')\n        return np.geterr()\nf = C()",
+    "node": (
+        "import epypes as ep\ndef g(x):\n    if x > 100: np.seterr(all='raise')\n    return np.geterr()\nf = ep.Node('f', g)"
+    ),
+    "function of a library": (
+        "def g(x): return 'raise' if x > 100 else None\n"
+        "func_dict, func_io = {'g': g, 'f': np.seterr}, {'g': ('x', 'z'), 'f': ('z', 'y')}"
+    ),
+}  # fmt: skip
+
+# By name: a module whose function changes something of a library, of an Enum or a logger above 100, through a helper.
+PATCHES_IN_A_BRANCH = {
+    "cv2.INTER_AREA": ("import cv2\ndef f(x):\n    if x > 100: cv2.__dict__.update(INTER_AREA=x)\n    return cv2.INTER_AREA"),
+    "colorsys.ONE_SIXTH": (
+        "import colorsys\ndef keep(owner, **values):\n    vars(owner).update(values)\n"
+        "def f(x):\n    if x > 100: keep(colorsys, ONE_SIXTH=x)\n    return colorsys.hls_to_rgb(0.1, 0.2, 0.3), colorsys.ONE_SIXTH"
+    ),
+    "textwrap._whitespace": (
+        "import textwrap\ndef keep(owner):\n    owner._whitespace = 'a'\ndef f(x):\n    if x > 100: keep(textwrap)\n    return textwrap._whitespace"
+    ),
+    "numpy.n_calls": (
+        "def keep(owner):\n    owner.n_calls = 1 + getattr(owner, 'n_calls', 0)\n"
+        "def f(x):\n    if x > 100: keep(np)\n    return getattr(np, 'n_calls', 0)"
+    ),
+    "numpy.linalg.norm": (
+        "def keep(owner, value):\n    owner.norm = value\ndef f(x):\n    if x > 100: keep(np.linalg, len)\n    return np.linalg.norm([3, 4])"
+    ),
+    "Fraction.limit_denominator": (
+        "from fractions import Fraction\ndef keep(owner, name, value):\n    setattr(owner, name, value)\n"
+        "def f(x):\n    if x > 100: keep(Fraction, 'limit_denominator', lambda self: 0)\n    return Fraction(1, 3).limit_denominator()"
+    ),
+    "indent.__defaults__": (
+        "from textwrap import indent\ndef keep(g, value):\n    g.__defaults__ = value\n"
+        "def f(x):\n    if x > 100: keep(indent, (bool,))\n    return indent('a\\n\\n', '> ')"
+    ),
+    "Colour.RED.seen": (
+        "import enum\nclass Colour(enum.Enum):\n    RED = 1\ndef keep(member):\n    member.seen = True\n"
+        "def f(x):\n    if x > 100: keep(Colour.RED)\n    return hasattr(Colour.RED, 'seen')"
+    ),
+    "LOG.seen": (
+        "import logging\nLOG = logging.getLogger('b')\ndef keep(log):\n    log.seen = 1\n"
+        "def f(x):\n    if x > 100: keep(LOG)\n    return hasattr(LOG, 'seen')"
+    ),
+}  # fmt: skip
+
+
 # Arrays are locked: NumPy itself refuses, at the line.
 LOCKED = {
     "array": "W = np.zeros(2)\ndef f(x):\n    if x > 100: W[0] += 1\n    return W.tolist()",
@@ -170,6 +256,163 @@ def test_a_call_that_changes_what_outlives_it_fails_and_is_undone(case, tmp_path
             assert (error.value.function, error.value.changed) == ("f", changed)
             assert runner.last.failure.function == "f"
         assert answer(runner, 1) == first
+
+
+def fails_and_is_undone(runner, changed):
+    first = answer(runner, 1)
+    for _ in range(5):
+        with pytest.raises(StateChanged) as error:
+            runner.run(x=200)
+        assert (error.value.function, error.value.changed, error.value.is_restored) == ("f", changed, True)
+        has_set = (
+            "numpy.s",
+            "sys.",
+            "cv2.set",
+            "warnings.",
+            "os.",
+            "decimal.",
+            "ContextVar",
+            "pandas",
+            "matplotlib",
+            "locale",
+        )
+        assert ("set it back before it returns" in str(error.value)) == changed.startswith(has_set)
+        assert answer(runner, 1) == first
+
+
+@pytest.mark.parametrize("setting", SETTINGS_OF_THE_PROCESS)
+def test_a_call_that_changes_a_setting_of_the_process_fails_by_its_name_and_is_undone(setting, tmp_path):
+    change, read = SETTINGS_OF_THE_PROCESS[setting]
+    source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
+    fails_and_is_undone(ep.load(bundle(tmp_path / "b", source)), setting.strip())
+
+
+@pytest.mark.parametrize("setting", QUIET_SETTINGS)
+def test_a_setting_that_changes_no_value_is_put_back_without_a_failure(setting, tmp_path):
+    change, read = QUIET_SETTINGS[setting]
+    source = f"{IMPORTS_OF_SETTINGS}def f(x):\n    if x > 100: {change}\n    return {read}"
+    with warnings.catch_warnings():
+        warnings.resetwarnings()
+        runner = ep.load(bundle(tmp_path / "b", source))
+        first = answer(runner, 1)
+        for _ in range(5):
+            assert answer(runner, 200) not in (first, "StateChanged")
+            assert answer(runner, 1) == first
+
+
+@pytest.mark.parametrize("kind", SETTERS)
+def test_settings_are_compared_whatever_kind_of_function_changes_them(kind, tmp_path):
+    fails_and_is_undone(ep.load(bundle(tmp_path / "b", SETTERS[kind])), "numpy.seterr")
+
+
+@pytest.mark.parametrize("name", PATCHES_IN_A_BRANCH)
+def test_a_call_that_patches_a_library_an_enumeration_or_a_logger_fails_and_is_undone(name, tmp_path):
+    fails_and_is_undone(ep.load(bundle(tmp_path / "b", PATCHES_IN_A_BRANCH[name])), name)
+
+
+@pytest.mark.parametrize(
+    ("seed", "draw"),
+    [
+        ("random.seed(x)", "random.random()"),
+        ("np.random.seed(x)", "np.random.rand()"),
+        ("cv2.setRNGSeed(x)", "cv2.randu(np.zeros(3), 0, 9).tolist()"),
+        ("seed(x)", "draw()"),
+    ],
+)
+def test_what_an_event_draws_depends_on_no_earlier_one_also_if_it_has_no_seed(seed, draw, tmp_path):
+    source = f"""
+from random import random as draw, seed
+import cv2
+def g(x):
+    if x < 100: {seed}
+    return x
+def f(x, z):
+    return {draw}
+func_dict, func_io = {{"g": g, "f": f}}, {{"g": ("x", "z"), "f": (("x", "z"), "y")}}
+"""
+    runner = ep.load(bundle(tmp_path / "b", source))
+    unseeded, seeded = answer(runner, 200), answer(runner, 1)
+    assert "Error" not in unseeded + seeded
+    assert unseeded != seeded
+    assert [answer(runner, x) for x in (2, 200, 200, 1, 3, 200, 1)][1:4] == [unseeded, unseeded, seeded]
+
+
+SETTING_AND_BACK = """
+import contextvars, decimal, os, warnings
+import cv2
+GAIN = contextvars.ContextVar('gain', default=1)
+def f(x):
+    n, token = cv2.getNumThreads(), GAIN.set(x)
+    cv2.setNumThreads(n + 1)
+    with warnings.catch_warnings(), np.errstate(all='raise'), np.printoptions(precision=2), decimal.localcontext(prec=3):
+        warnings.simplefilter('error')
+        found = str(decimal.Decimal(1) / 3), os.path.join('a', 'b'), GAIN.get()
+    GAIN.reset(token)
+    cv2.setNumThreads(n)
+    return found
+"""
+
+
+def test_settings_that_a_call_changes_and_puts_back_are_no_change_also_in_threads(tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", SETTING_AND_BACK))
+    with ThreadPoolExecutor(8) as pool:
+        found = [*pool.map(lambda x: answer(runner, x), range(200))]
+    assert found == [f"('0.333', 'a/b', {x})" for x in range(200)]
+
+
+CATCHING = """
+import threading, warnings
+caught, ended = threading.Barrier(2), threading.Event()
+def f(x):
+    if x > 100:
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            caught.wait(60)
+            ended.wait(60)
+    return x
+def g(x):
+    caught.wait(60)
+    return x
+func_dict, func_io = {"f": f, "g": g}, {"f": ("x", "y"), "g": ("x", "z")}
+"""
+
+
+def test_a_call_that_catches_warnings_has_no_other_one_called_again(tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", CATCHING))
+    ended = runner.cg.functions["f"].__globals__["ended"]
+    with ThreadPoolExecutor(1) as pool:
+        catching = pool.submit(lambda: runner.run("y", x=200)["y"])
+        assert runner.run("z", x=1)["z"] == 1, "it ends before the other one, and is called once"
+        ended.set()
+        assert catching.result(60) == 200
+
+
+def test_settings_that_are_changed_between_events_are_no_change_and_stay(tmp_path):
+    runner = ep.load(
+        bundle(tmp_path / "b", "import cv2\ndef f(x):\n    return np.geterr()['over'], cv2.getNumThreads()")
+    )
+    threads = cv2.getNumThreads()
+    try:
+        for number in (threads + 1, threads):
+            cv2.setNumThreads(number)
+            with np.errstate(over="raise"):
+                assert answer(runner, 1) == f"('raise', {number})"
+            assert cv2.getNumThreads() == number
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def test_what_a_module_sets_when_it_is_imported_is_no_change(tmp_path, monkeypatch):
+    (tmp_path / "setting_module.py").write_text(
+        "import warnings, sys\nwarnings.simplefilter('error')\nsys.setrecursionlimit(4321)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    source = (
+        "import sys\ndef f(x):\n    if x > 100: import setting_module\n    return x, sys.getrecursionlimit() == 4321"
+    )
+    runner = ep.load(bundle(tmp_path / "b", source))
+    assert [answer(runner, x) for x in (1, 200, 1, 200)] == ["(1, False)", "(200, True)", "(1, False)", "(200, False)"]
+    sys.modules.pop("setting_module", None)
 
 
 @pytest.mark.parametrize("case", LOCKED)
@@ -222,6 +465,7 @@ CONSTANT = {
     "cache that is held in a tuple": "CACHES = (functools.cache(lambda n: [n]),)\n"
     "def f(x):\n    CACHES[0](3).append(x)\n    return len(CACHES[0](3))",
     "dispatch": "@functools.singledispatch\ndef g(x): return x\n@g.register\ndef _(x: int): return x + 1\ndef f(x):\n    return g(x)",
+    "logger": "import logging\nLOG = logging.getLogger('b')\ndef f(x):\n    LOG.setLevel(x)\n    LOG.warning('x')\n    return x",
     "enumeration": "import enum\nclass E(enum.Flag):\n    A = 1\n    B = 2\ndef f(x):\n    return (E.A | E.B).value, E(x % 4).value",
     "warning": "import warnings\nn = 0\ndef f(x):\n    global n\n    with warnings.catch_warnings(record=True):\n        warnings.warn('a')\n    return x + n",
 }  # fmt: skip
