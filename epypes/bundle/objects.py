@@ -237,7 +237,8 @@ def _module(module: types.ModuleType) -> Description:
 def _class(kind: type) -> Description:
     left_out = {*_OF_EVERY_CLASS}
     parts: list[tuple[str, Any]] = [(" metaclass", type(kind)), (" bases", kind.__bases__), *_annotations(kind)]
-    parts.append((f"{ANNOTATION}its docstring", kind.__doc__))
+    if isinstance(kind.__doc__, str):  # a class of C code may have a descriptor for it
+        parts.append((f"{ANNOTATION}its docstring", kind.__doc__))
     if "__dataclass_params__" in vars(kind):
         parts.append((" options", repr(vars(kind)["__dataclass_params__"])))
     if isinstance(kind, enum.EnumMeta):

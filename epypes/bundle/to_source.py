@@ -368,7 +368,7 @@ class _Function:
         module.texts.append(self._text())
 
     def _find_places(self, delays: Iterable[str], keepers: Iterable[str], *, is_whole: bool) -> set[str]:
-        """Find where each function stands; return the tokens that are needed.
+        """Find where each function stands; return the tokens that are needed or kept.
 
         Raises
         ------
@@ -392,7 +392,7 @@ class _Function:
         missing = [each for each in cg.placeholders if each in self.places]
         if missing:
             raise PlaceholderNeeded(missing)
-        return tokens
+        return tokens | made.keys()  # also if what makes them is refused
 
     # -- the expressions that it is made of ----------------------------------------------------------------------------
 

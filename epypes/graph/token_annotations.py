@@ -79,8 +79,10 @@ def _is_annotated(function: Any) -> bool:
             return bool(function.__annotations__)
         except Exception:  # Python 3.14 evaluates them here; what that raises is the user's
             return False
-    # Other objects show the annotations of their class, which are not those of a call.
-    return type(function) is MethodType or innermost(function) is not function
+    if type(function) is MethodType or innermost(function) is not function:
+        return True
+    # Other objects show the annotations of their class, which are not those of a call, unless they have their own.
+    return not isinstance(function, type) and "__annotations__" in getattr(function, "__dict__", ())
 
 
 def _hints_of(function: object) -> Mapping[str, Any]:
