@@ -104,9 +104,6 @@ _OF_A_NODE: Final = frozenset({*vars(Node("", len)), "compute"})
 _OF_A_LOGGER: Final = frozenset(vars(Logger("")))  # noqa: LOG001 - one that nobody uses
 # By these code binds names that its instructions don't say.
 _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
-# Code with one of these names may draw from a generator of the whole process, unless it makes its own.
-_DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
-_OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
 # Py_TPFLAGS_HEAPTYPE: a class with this flag is no static one of C, which takes no attributes.
 _MADE_BY_PYTHON: Final = 1 << 9
 _SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
@@ -134,6 +131,8 @@ class CodeSnapshot(Snapshot):
         What puts back or forgets, after each call, what a call may change without a failure.
     nodes
         The nodes and pipelines that were met, by id.
+    words
+        The names that the code has, its instructions, and the names of the libraries whose objects it names.
     has_code
         Whether code of the user was met.
     """
@@ -143,7 +142,7 @@ class CodeSnapshot(Snapshot):
         self.resets: list[Callable[[], object]] = []
         self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
-        self._code: set[str] = set()  # its names and instructions
+        self.words: set[str] = set()
         self.has_code = False
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
@@ -151,18 +150,13 @@ class CodeSnapshot(Snapshot):
         self._of_libraries: dict[int, tuple[str, Any]] = {}
         super().__init__(functions)
         for needed, add in self._possible:
-            if needed & self._code:
+            if needed & self.words:
                 add()
         self._possible.clear()
         self._compare_libraries()
 
     def __bool__(self) -> bool:
         return bool(self.records or self.resets or self._caches)
-
-    @property
-    def words(self) -> frozenset[str]:
-        """The names that the code has, and those of the libraries whose objects it names."""
-        return frozenset(self._code)
 
     def changed(self) -> str | None:
         """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
@@ -198,10 +192,10 @@ class CodeSnapshot(Snapshot):
         kind = type(value)
         home = value.__name__ if kind is types.ModuleType else getattr(value, "__module__", None)
         if is_global_generator(getattr(value, "__self__", None)):
-            self._code.add("random")
+            self.words.add("random")
         if isinstance(home, str):
             top = home.partition(".")[0]
-            self._code |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
+            self.words |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
         if kind is types.FunctionType:
             return self._look_at_function(value)
         if issubclass(kind, type):
@@ -275,12 +269,12 @@ class CodeSnapshot(Snapshot):
     def _note_instructions(self, code: types.CodeType) -> None:
         """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
         self.has_code = True
-        self._code.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
+        self.words.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
             if operation.startswith(("STORE_", "DELETE_")):
                 is_free = operation.endswith("_DEREF") and name in code.co_freevars
-                self._code |= {operation, f"{operation} {name}", *(["nonlocal"] if is_free else [])}
+                self.words |= {operation, f"{operation} {name}", *(["nonlocal"] if is_free else [])}
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):
@@ -290,10 +284,10 @@ class CodeSnapshot(Snapshot):
             self._of_libraries[id(kind)] = f"{kind.__name__}.", kind
 
     def _look_at_module(self, module: types.ModuleType) -> Found:
-        if is_own(module.__name__):
-            yield from self._look_at_names(f"{plain_name(module.__name__)}.", vars(module))
-        else:
+        if not is_own(module.__name__):
             self._of_libraries[id(module)] = f"{module.__name__}.", module
+            return iter(())
+        return self._look_at_names(f"{plain_name(module.__name__)}.", vars(module))
 
     def _look_at_names(self, prefix: str, owner: Any) -> Found:
         _check_caches(owner)
@@ -325,15 +319,15 @@ class CodeSnapshot(Snapshot):
 
     def _compare_libraries(self) -> None:
         """Compare what the code may bind in the libraries that it names: all of it, or what its instructions say."""
-        stored = frozenset(word.partition(" ")[2] for word in self._code if word[:10] in ("STORE_ATTR", "DELETE_ATT"))
-        names = None if _BINDS_BY_TEXT & self._code else stored
+        stored = frozenset(word.partition(" ")[2] for word in self.words if word[:10] in ("STORE_ATTR", "DELETE_ATT"))
+        names = None if _BINDS_BY_TEXT & self.words else stored
         waiting = [*self._of_libraries.values()] if names is None or names else []
         while waiting:
             prefix, owner = waiting.pop()
             if _can_be_patched(owner, names) and prefix.partition(".")[0] not in OF_THE_PROCESS:
                 self.records.append(_LibraryBindings(prefix, owner, names))
             if isinstance(owner, types.ModuleType):
-                for name in self._code & vars(owner).keys():
+                for name in self.words & vars(owner).keys():
                     part = vars(owner)[name]
                     is_new = id(part) not in self._of_libraries
                     if is_new and isinstance(part, types.ModuleType | types.FunctionType | type):
@@ -597,7 +591,7 @@ class MutableState:
         self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
     ) -> Callable[..., Any]:
         lock, referred, settings = self._lock, self._referred, self._settings
-        draws = not snapshot.words.isdisjoint(_DRAWS) and snapshot.words.isdisjoint(_OWN_GENERATORS)
+        draws = self._generators.are_drawn_by(snapshot.words)
         has_resets = draws or bool(snapshot.resets)
         attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
@@ -646,12 +640,9 @@ class MutableState:
         return call
 
 
-_Outcome = tuple[Any, BaseException | None, str | None]
-
-
 def _attempt(
     function: Callable[..., Any], snapshot: CodeSnapshot | None, settings: ProcessSettings, args: Any, kwargs: Any
-) -> _Outcome:
+) -> tuple[Any, BaseException | None, str | None]:
     """Call a function; return its result, what it has raised, and what it has changed that outlives the call."""
     # What the call sets in the context is gone with that.
     context, modules, error = copy_context(), len(sys.modules), None

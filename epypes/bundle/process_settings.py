@@ -14,6 +14,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from contextvars import Context, copy_context
 from typing import Any, Final, NamedTuple
@@ -24,6 +25,11 @@ WARNINGS: Final = "warnings.simplefilter"
 CONTEXT_VARIABLE: Final = "ContextVar "
 # What these put into other modules and settings, every notebook has.
 OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
+
+
+# Code with one of these names may draw from a generator of the whole process, unless it makes its own.
+_DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
+_OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
 
 
 # -- the table of settings -------------------------------------------------------------------------------------------
@@ -253,7 +259,7 @@ class ProcessSettings:
         self._known: list[tuple[Callable[[], Any], Any]] = []
         self.add(frozenset())
 
-    def add(self, words: frozenset[str]) -> None:
+    def add(self, words: AbstractSet[str]) -> None:
         """Compare from now on what code with these names may set, and what is always compared."""
         loaded = (one for one in SETTINGS if one.module in sys.modules)
         self._compared = [one for one in loaded if one in self._compared or not one.words or one.words & words]
@@ -326,6 +332,11 @@ class GlobalGenerators:
         self._numpy = sys.modules.get("numpy.random")
         self._first = random.getstate(), self._numpy.get_state() if self._numpy else None
         self._local = threading.local()
+
+    @staticmethod
+    def are_drawn_by(words: AbstractSet[str]) -> bool:
+        """Whether code with these names may draw from them."""
+        return not words.isdisjoint(_DRAWS) and words.isdisjoint(_OWN_GENERATORS)
 
     def begin(self, name: str) -> None:
         """Note that a function is called which may draw from them; put them back where an event begins."""
