@@ -149,9 +149,11 @@ def _text(value: Any) -> str:
         return f"{value.__module__}.{value.__qualname__}"
     if kind is types.FunctionType:
         home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
+        # The wrappers of networkx, some of which are objects, get code and attributes when they are first called.
         wrapped = value.__dict__.get("__wrapped__")
-        if isinstance(wrapped, types.FunctionType):
-            # The wrapper of networkx gets its own code when it is first called.
+        while wrapped is not None and not isinstance(wrapped, types.FunctionType):
+            wrapped = getattr(wrapped, "__dict__", {}).get("__wrapped__")
+        if wrapped is not None:
             return f"{home} {_text(wrapped)}"
         # Without objects such as sys.stdout; of functions the name, since they may refer to each other.
         given = [*enumerate(value.__defaults__ or ()), *sorted((value.__kwdefaults__ or {}).items())]

@@ -52,6 +52,7 @@ def outlived(broker, sub, pub, restarted_by):
         until(lambda: left(sub) == 0, lambda: f"{left(sub)} events to be acknowledged")
         for replica in replicas:
             replica.end()
+        until(lambda: left(pub) == 0, lambda: f"{left(pub)} answers to be acknowledged")
         check(reader, letters)
     shares = Counter(answer.parts["process"] for answer in reader.answers)
     assert all(shares[replica.process.pid] > COUNT // 50 for replica in replicas[1:]), shares

@@ -235,11 +235,12 @@ def test_a_notebook_that_has_used_libraries_a_lot_is_promoted(monkeypatch, tmp_p
     segmentation.slic(X, 5, channel_axis=None)
     exposure.equalize_adapthist(X)
     scipy.stats.norm.fit(X.ravel())
-    networkx.ancestors(networkx.DiGraph([(1, 2)]), 2)  # gets its code at its first call
+    networkx.ancestors(networkx.DiGraph([(1, 2)]), 2)  # these get their code at their first call
+    networkx.path_graph(3)
     source = (
         "import networkx, random, tempfile\nimport pandas as pd\nimport matplotlib.pyplot as plt\nimport scipy.ndimage, scipy.stats\n"
         "from skimage import filters, measure\n"
-        "def use(x):\n    if x.mean() > 200:\n        return plt.figure(), tempfile.mkdtemp(), random.random()\n"
+        "def use(x):\n    if x.mean() > 200:\n        return plt.figure(), tempfile.mkdtemp(), random.random(), networkx.path_graph(3)\n"
         "    labels = measure.label(x > filters.threshold_otsu(x))\n"
         "    found = pd.DataFrame(measure.regionprops_table(labels, x, properties=('area',)))\n"
         "    return float(found['area'].sum() + scipy.ndimage.sobel(x).max() + scipy.stats.norm(0, 1).cdf(x[0, 0]))"
