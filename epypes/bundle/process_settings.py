@@ -12,6 +12,7 @@ import operator
 import random
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
@@ -190,6 +191,7 @@ def _texts_of(prefix: str, left_out: tuple[str, ...]) -> Callable[[Mapping[str, 
 def _set_environment(os: Any, variables: Mapping[bytes, bytes]) -> None:
     os.environ.clear()
     os.environ.update({os.fsdecode(name): os.fsdecode(value) for name, value in variables.items()})
+    time.tzset()  # C code has its own copy of TZ
 
 
 def _of_functions(name: str, getter: str, words: str = "", by_keyword: bool = False, **more: Any) -> Setting:

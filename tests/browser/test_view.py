@@ -409,6 +409,15 @@ def test_what_can_not_be_taken_is_marked_and_not_sent(view: ViewPage, typed: str
     assert view.page.input_value(KERNEL) == "5"
 
 
+def test_what_was_refused_goes_when_the_slider_is_moved(view: ViewPage) -> None:
+    view.page.fill(KERNEL, "99")
+    view.press("Enter")
+    view.do("kernel.models['model-1'].set(21, true)")
+    view.until("document.querySelector('.epypes-row-1 .epypes-number, [data-name=blur_kernel]').value === '21'")
+    assert view.attribute(KERNEL, "aria-invalid") == "false"
+    assert "range" not in view.text(".epypes-status")
+
+
 def test_a_pair_keeps_its_order(view: ViewPage) -> None:
     view.page.fill(".epypes-row-4 .epypes-number >> nth=0", "201")
     view.press("Enter")

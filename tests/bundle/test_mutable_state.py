@@ -155,6 +155,7 @@ SETTINGS_OF_THE_PROCESS = {
     "decimal.getcontext ": ("decimal.getcontext().traps[decimal.Inexact] = True", "dict(decimal.getcontext().traps)"),
     "os.environ": ("os.environ['EPYPES_TEST'] = '1'", "os.environ.get('EPYPES_TEST')"),
     "os.environ ": ("os.environ.pop('HOME', None)", "os.environ.get('HOME')"),
+    "os.environ  ": ("os.environ.update(TZ='XYZ-9'); time.tzset()", "time.localtime(0).tm_hour"),
     "os.chdir": ("os.chdir('/')", "os.getcwd()"),
     "os.chdir ": ("go('/')", "os.getcwd()"),
     "ContextVar gain": ("GAIN.set(2)", "GAIN.get()"),
@@ -170,7 +171,7 @@ QUIET_SETTINGS = {
     "warnings.simplefilter": ("warnings.simplefilter('ignore')", "[*warnings.filters]"),
 }
 IMPORTS_OF_SETTINGS = (
-    "import contextvars, decimal, locale, os, sys, warnings\nimport cv2, matplotlib\nimport pandas as pd\nfrom os import chdir as go\n"
+    "import contextvars, decimal, locale, os, sys, time, warnings\nimport cv2, matplotlib\nimport pandas as pd\nfrom os import chdir as go\n"
     "GAIN, KERNEL = contextvars.ContextVar('gain', default=1), contextvars.ContextVar('kernel')\nKERNEL.set(np.zeros(3))\n"
 )
 

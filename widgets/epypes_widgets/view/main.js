@@ -192,12 +192,13 @@ function render({ model, el }) {
   return () => {
     answered();
     closing.abort();
-    send({ kind: "closed" });
     model.off("msg:custom", onMessage);
     out.close();
     stage.close();
     [stage.picture, stage.other].forEach((img) => clear(img));
     figure.remove();
+    // Last: it raises if the kernel is gone.
+    send({ kind: "closed" });
   };
 }
 

@@ -31,9 +31,11 @@ export function numberBox(panel, row, index) {
     panel.tell(problem);
   }
 
+  const isRefused = () => input.getAttribute("aria-invalid") === "true";
+
   function restore() {
     isTyping = false;
-    if (input.getAttribute("aria-invalid") === "true") complain("");
+    if (isRefused()) complain("");
     show();
   }
 
@@ -57,7 +59,7 @@ export function numberBox(panel, row, index) {
     if (event.key === "Enter") {
       if (isTyping) commit();
       else panel.commit();
-      if (input.getAttribute("aria-invalid") !== "true") input.select();
+      if (!isRefused()) input.select();
     } else if (event.key === "Escape") restore();
     else if (count) {
       event.preventDefault();
@@ -80,11 +82,12 @@ export function numberBox(panel, row, index) {
   return {
     input,
     name,
-    /** The slider was moved, by the user or by the kernel. */
+    /** The slider was moved, by the user or by the kernel; what was typed and refused goes then. */
     moved(value) {
       if (same(value, position)) return;
       position = value;
-      show();
+      if (isRefused()) restore();
+      else show();
     },
     /** A run with this value completed. */
     ran(value) {
