@@ -464,7 +464,8 @@ class SideBySide:
             self._is_over = True
             self._changed.notify_all()
         if self._failures:
-            failed_at = min(self._failures)
+            # Ctrl-C or an exit comes before what functions raise.
+            failed_at = min(self._failures, key=lambda place: (isinstance(self._failures[place], Exception), place))
             tokens.values[:], tokens.dirty[:] = self._before
             for place, made in sorted(self._made.items()):
                 step = tokens.program.steps[place]
@@ -474,7 +475,7 @@ class SideBySide:
                     tokens.store(step, made)
             for place in self._failures:
                 if place != failed_at:
-                    del self._durations_ns[place]
+                    self._durations_ns.pop(place, None)  # one that was interrupted while it ran has none
             tokens.running = failed_at
             raise self._failures[failed_at]
 

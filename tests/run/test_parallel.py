@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import contextvars
 import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -220,6 +222,40 @@ except KeyboardInterrupt:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("interrupted")
+
+
+def waits(thread):
+    """Whether a thread waits for others to be done."""
+    return sys._current_frames()[thread.ident].f_code.co_name == "wait"
+
+
+@pytest.mark.parametrize("comes", ["while it waits", "in a function"])
+def test_ctrl_c_is_raised_also_if_a_function_has_failed(comes, always):
+    main, threads, is_over = threading.current_thread(), [], threading.Event()
+
+    def until(condition):
+        end_s = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < end_s
+
+    def f(x):
+        here = threading.current_thread()
+        threads.append(here)
+        until(lambda: len(threads) == 2)
+        if here is not main and comes == "while it waits":
+            until(lambda: waits(main))
+            signal.pthread_kill(main.ident, signal.SIGINT)
+            is_over.wait(60)
+        elif here is main and comes == "in a function":
+            until(lambda: waits(next(one for one in threads if one is not main)))
+            raise KeyboardInterrupt
+        raise ValueError
+
+    runner = ep.CompGraphRunner(fork(2, f), workers=2)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(x=1)
+    is_over.set()
+    assert isinstance(runner.last.failure.exception, KeyboardInterrupt)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system can't fork")
