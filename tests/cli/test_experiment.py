@@ -106,7 +106,8 @@ def test_ctrl_c_ends_everything_without_a_traceback(layout):
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate()
         watchdog.cancel()
-    assert process.returncode == 130, err
+    # A shell shows 130 for both.
+    assert process.returncode in (130, -signal.SIGINT), err
     assert err.strip() == out == ""
     _, alive = psutil.wait_procs(children, timeout=TIMEOUT_S)
     assert not alive
