@@ -174,10 +174,11 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         refused |= {
             entry.token for entry in found if not entry.is_noise and (entry.token, entry.function) != (ANSWER, "f_out")
         }
-        settings = _changed_settings(usual, draft)
+        places, calls = places_of_change()
+        settings = _changed_settings(usual, draft, places, calls)
         notes = [reason for name, reason in settings.items() if is_of_texts(name)]
         reasons = [reason for name, reason in settings.items() if not is_of_texts(name)]
-        reasons += _changed_libraries(usual, other, draft)
+        reasons += _changed_libraries(usual, other, draft, places)
         if refused or usual.outside or not usual.tokens:
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
@@ -204,12 +205,13 @@ def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, change
         return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
 
 
-def _changed_settings(usual: ReplayReport, bundle: Path) -> dict[str, str]:
+def _changed_settings(
+    usual: ReplayReport, bundle: Path, places: Mapping[str, str], calls: Mapping[str, str]
+) -> dict[str, str]:
     """Return by name what this process has set in libraries that is set otherwise in a fresh one, as sentences."""
     here, nodes = library_settings(), [*ast.walk(ast.parse(code_of(bundle)))]
     catches = any(isinstance(node, ast.ExceptHandler) or getattr(node, "attr", "") == "suppress" for node in nodes)
     found: dict[str, str] = {}
-    places, calls = places_of_change()
     for name, default in usual.library_settings.items():
         value = here.get(name, default)
         if value != default and (name != WARNINGS or catches):
@@ -223,7 +225,7 @@ def _changed_settings(usual: ReplayReport, bundle: Path) -> dict[str, str]:
     return found
 
 
-def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path) -> list[str]:
+def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path, places: Mapping[str, str]) -> list[str]:
     """Return what this process has changed in the libraries of a bundle, as sentences."""
     # What two fresh processes have otherwise depends on the process, and is no change.
     fresh = {
@@ -231,12 +233,12 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path) -
         for library, described in usual.libraries.items()
         if (others := other.libraries.get(library, described)) is not None
     }
-    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle), places_of_change()[0])
+    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle), places)
     # One change is found wherever a library has the object; the shortest of these names is the best known.
     distinct: dict[tuple[str, str, str], str] = {}
     for (library, name), both in sorted(changed.items(), key=lambda item: len(item[0][0])):
         distinct.setdefault((name, *both), library)
-    found, places = [], places_of_change()[0]
+    found = []
     for (name, value, default), library in distinct.items():
         here, there = (_DIGEST.sub("", text) for text in (value, default or "it is not there"))
         place = places.get(name.rpartition(".")[2])

@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
+import inspect
 import sys
 import types
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -150,10 +151,8 @@ def _text(value: Any) -> str:
     if kind is types.FunctionType:
         home = f"{value.__globals__.get('__name__')}.{value.__qualname__}"
         # The wrappers of networkx, some of which are objects, get code and attributes when they are first called.
-        wrapped = value.__dict__.get("__wrapped__")
-        while wrapped is not None and not isinstance(wrapped, types.FunctionType):
-            wrapped = getattr(wrapped, "__dict__", {}).get("__wrapped__")
-        if wrapped is not None:
+        wrapped = inspect.unwrap(value, stop=lambda one: one is not value and isinstance(one, types.FunctionType))
+        if wrapped is not value and isinstance(wrapped, types.FunctionType):
             return f"{home} {_text(wrapped)}"
         # Without objects such as sys.stdout; of functions the name, since they may refer to each other.
         given = [*enumerate(value.__defaults__ or ()), *sorted((value.__kwdefaults__ or {}).items())]

@@ -30,7 +30,7 @@ from typing import Any, Final, NamedTuple, cast
 from epypes.bundle.compare import exact_text
 from epypes.bundle.expressions import has_steady_order
 from epypes.bundle.private_import import import_module, loaded_module, plain_name
-from epypes.bundle.references import defaults_of, global_names, imported_modules, meanings_of, nested_codes
+from epypes.bundle.references import defaults_of, imported_modules, meanings_of, nested_codes, reads_of
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner
@@ -187,7 +187,7 @@ def _function(function: types.FunctionType) -> Description:
     code = function.__code__
     # The code of a library says what it reads of its own module.
     home = str(function.__globals__.get("__name__")) if is_of_library(function) else ""
-    meanings = meanings_of(function, {*code.co_freevars, *(() if home else global_names(code))})
+    meanings = meanings_of(function, code.co_freevars) if home else reads_of(function)
     parts: list[tuple[str, Any]] = [(CODE, code)]
     parts += ((f" default of {name!r}", value) for name, value in sorted(defaults_of(function).items()))
     parts += _annotations(function)
@@ -418,9 +418,7 @@ def module_reads(function: types.FunctionType) -> list[tuple[str, Any]]:
         with suppress(Exception):  # the function raises the same when it is called
             if not will_be_installed(name):
                 found.append((plain_name(name), import_module(name)))
-    # In an order that is the same in each process.
-    meanings = meanings_of(function, sorted({*function.__code__.co_freevars, *global_names(function.__code__)}))
-    waiting, seen = [*meanings.items(), *found], set[str]()
+    waiting, seen = [*reads_of(function).items(), *found], set[str]()
     while waiting:
         name, value = waiting.pop()
         if isinstance(value, types.ModuleType) and value.__name__ not in seen and not is_installed(value.__name__):

@@ -123,7 +123,7 @@ def meanings_of(function: types.FunctionType, names: Iterable[str]) -> dict[str,
 
 
 def reads_of(function: types.FunctionType) -> dict[str, Any]:
-    """Return what the names that a function reads mean to it, in order of the names."""
+    """Return what the names that a function reads mean to it, in order of the names, as in any other process."""
     return meanings_of(function, sorted({*function.__code__.co_freevars, *global_names(function.__code__)}))
 
 

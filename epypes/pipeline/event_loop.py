@@ -274,7 +274,7 @@ class EventLoop(OldNames):
                 self._report(event, exception)
                 self._settle(event, exception)
             else:
-                if getattr(type(event), "ack", None) is not None:  # is_kept
+                if is_kept(event):
                     self._settle(event, None)
             poll_s = POLL_S
             # An event may be large: it shall not live on until another comes.

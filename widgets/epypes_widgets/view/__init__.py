@@ -61,9 +61,9 @@ def script(entry: str = "main.js") -> str:
     return "\n".join(f"// {name}\n{source}" for name, source in sources.items())
 
 
-def styles(name: str = "view.css") -> str:
-    """Return a style sheet."""
-    return (_HERE / name).read_text(encoding="utf-8")
+def styles() -> str:
+    """Return the style sheet of the view and of the picker."""
+    return (_HERE / "view.css").read_text(encoding="utf-8")
 
 
 def use_subshell(widget: ipywidgets.Widget) -> None:
