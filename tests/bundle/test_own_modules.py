@@ -31,6 +31,8 @@ def project(tmp_path, monkeypatch):
     folder = tmp_path / "project"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
+    # A compiled file is taken for that of a module which is written again within a second, if it is as long.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     before = {*sys.modules}
     yield Project(folder, monkeypatch)
     for name in sys.modules.keys() - before:
@@ -206,11 +208,11 @@ def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_a
 def test_two_versions_of_a_module_live_in_one_process_beside_the_notebooks(project):
     project.write(lib="def f(x):\n    import more\n    return x + more.K\n", more="K = 1\n")
     one = project.promote("import lib", f="lib.f", to="one")
-    project.write(lib="def f(x):\n    import more\n    return x - 1 * more.K\n", more="K = 20\n")
+    project.write(lib="def f(x):\n    import more\n    return x - more.K\n", more="K = 20\n")
     for name in ("lib", "more"):
         del sys.modules[name]
     other = project.promote("import lib", f="lib.f", to="other")
-    project.write(lib="def f(x):\n    return None  # nothing\n", more="K = None\n")
+    project.write(lib="def f(x):\n    return None\n", more="K = None\n")
     first, second = ep.load(one), ep.load(other)
     x = np.arange(3.0)
     for _ in range(2):
