@@ -175,7 +175,8 @@ def show(
         The groups whose functions are drawn one by one.
     collapse
         Whether groups are drawn as one box each, but for those that are open. Beside those of ``ep.group``, functions
-        whose names have one prefix (``left.blur``, ``left.canny`` ...) are a group in a graph of more than 24.
+        whose names have one prefix (``left.blur``, ``left.canny`` ...) are a group in a graph of more than 24; if it
+        has still more than 24 boxes, so are stretches of the way that the data takes (``"blur … canny"``).
 
     Returns
     -------

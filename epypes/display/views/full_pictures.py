@@ -11,17 +11,20 @@ from __future__ import annotations
 import re
 import secrets
 import sys
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any, Final
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
-from epypes.display.previews import THUMBNAIL_PX, Picture
+from epypes.display.previews import THUMBNAIL_PX, Picture, Scene
 from epypes.display.previews.drawing import scene_picture
 from epypes.display.text import KEPT_CHARACTERS
 from epypes.display.views.graphview import GraphView, TokenView, has_picture
 from epypes.display.views.surroundings import scene_of
+from epypes.display.views.tokens import is_locked_array
 from epypes.run import CompGraphRunner, Run
+from epypes.run.program import Program
 
 _KEPT_PX: Final = 512
 _KEPT_BYTES: Final = 20_000
@@ -33,6 +36,9 @@ _FULL_BYTES: Final = 2_000_000
 
 # What a page names a run by. A kernel that was started again has the same id, but never the same names.
 _names: WeakKeyDictionary[Run, str] = WeakKeyDictionary()
+# By program and token the last picture that a page keeps, with the image that it is of and its range.
+_Made = tuple[Callable[[], Any], tuple[Any, int], Picture]
+_made: WeakKeyDictionary[Program, dict[str, _Made]] = WeakKeyDictionary()
 _process, _numbers = secrets.token_hex(6), count()
 
 
@@ -54,9 +60,21 @@ def kept_pictures(graph: GraphView, run: Run) -> dict[str, Picture]:
             break
         scene = scene_of(run, token.name)
         if scene is not None and max(scene.backdrop.image.shape[:2]) > THUMBNAIL_PX:
-            kept[token.name] = picture = scene_picture(scene, _KEPT_PX, most_bytes)
+            kept[token.name] = picture = _kept_picture(run, token.name, scene, most_bytes)
             left -= len(picture.uri)
     return kept
+
+
+def _kept_picture(run: Run, token: str, scene: Scene, most_bytes: int) -> Picture:
+    """Return a token's picture for the page; that of an image that nobody can change is made once."""
+    made, image = _made.setdefault(run.tokens.program, {}), scene.backdrop.image
+    key = (scene.backdrop.ends, most_bytes)
+    if token not in made or made[token][0]() is not image or made[token][1] != key:
+        picture = scene_picture(scene, _KEPT_PX, most_bytes)
+        if scene.marks is not None or not is_locked_array(image):
+            return picture
+        made[token] = ref(image), key, picture
+    return made[token][2]
 
 
 def drawn_tokens(graph: GraphView) -> list[TokenView]:

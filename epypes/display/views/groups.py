@@ -15,7 +15,7 @@ from epypes.graph import CompGraph
 from epypes.wording import counted
 
 # A graph of so many functions fits on a page; every one that is hidden costs a click.
-_MOST_SHOWN: Final = 24
+MOST_SHOWN: Final = 24
 # Two functions take hardly more room than the box of their group.
 _LEAST_SHARED: Final = 3
 _REDEFINED: Final = "redefined inside: build again"
@@ -36,7 +36,7 @@ def groups_of(functions: Collection[str], given: Mapping[str, Sequence[str]]) ->
         The groups that were made by ``ep.group``; others are found by the prefixes of names, if the functions are many.
     """
     found = {name: tuple(inside) for name, inside in given.items()}
-    if len(functions) <= _MOST_SHOWN:
+    if len(functions) <= MOST_SHOWN:
         return found
     grouped = {name for inside in given.values() for name in inside}
     alike: dict[str, list[str]] = {}
