@@ -19,6 +19,7 @@ from weakref import WeakKeyDictionary, ref
 
 from epypes.display.previews import THUMBNAIL_PX, Picture, Scene
 from epypes.display.previews.drawing import scene_picture
+from epypes.display.previews.images import is_mask, one_channel, sampled
 from epypes.display.text import KEPT_CHARACTERS
 from epypes.display.views.graphview import GraphView, TokenView, has_picture
 from epypes.display.views.surroundings import scene_of
@@ -27,6 +28,8 @@ from epypes.run import CompGraphRunner, Run
 from epypes.run.program import Program
 
 _KEPT_PX: Final = 512
+# A mask is made smaller by whole numbers; one of 640 x 480 stays as it is.
+_KEPT_MASK_PX: Final = 640
 _KEPT_BYTES: Final = 20_000
 # What a picture of 512 pixels shows in fewer bytes is hardly more than the thumbnail.
 _LEAST_BYTES: Final = 6_000
@@ -70,7 +73,8 @@ def _kept_picture(run: Run, token: str, scene: Scene, most_bytes: int) -> Pictur
     made, image = _made.setdefault(run.tokens.program, {}), scene.backdrop.image
     key = (scene.backdrop.ends, most_bytes)
     if token not in made or made[token][0]() is not image or made[token][1] != key:
-        picture = scene_picture(scene, _KEPT_PX, most_bytes)
+        side_px = _KEPT_MASK_PX if scene.marks is None and is_mask(one_channel(sampled(image))) else _KEPT_PX
+        picture = scene_picture(scene, side_px, most_bytes)
         if scene.marks is not None or not is_locked_array(image):
             return picture
         made[token] = ref(image), key, picture
