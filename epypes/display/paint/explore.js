@@ -191,8 +191,9 @@
       // The card would lie over it.
       open(false);
       if (openInside(figure, data.groups?.[chosen])) return;
+      const view = svg.parentElement, at = vertices[chosen].getBoundingClientRect(), port = view.getBoundingClientRect();
+      view.scrollBy(Math.max(0, at.right - port.left - view.clientWidth), Math.max(0, at.bottom - port.top - view.clientHeight));
       about.scrollIntoView({ block: "nearest" });
-      vertices[chosen].scrollIntoView({ block: "nearest", inline: "nearest" });
     }
 
     const at = (event) => `${event.screenX} ${event.screenY}`;

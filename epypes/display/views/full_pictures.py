@@ -30,7 +30,7 @@ from epypes.run.program import Program
 _KEPT_PX: Final = 512
 # A mask is made smaller by whole numbers; one of 640 x 480 stays as it is.
 _KEPT_MASK_PX: Final = 640
-_KEPT_BYTES: Final = 20_000
+_KEPT_BYTES: Final = 28_000
 # What a picture of 512 pixels shows in fewer bytes is hardly more than the thumbnail.
 _LEAST_BYTES: Final = 6_000
 # An image of 1 MP is whole, one of 12 MP is halved.
