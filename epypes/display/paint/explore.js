@@ -156,7 +156,10 @@
     function show(place) {
       if (place === near) return;
       near = place;
-      if (place >= 0) card.replaceChildren(...picture("card", place, vertices[place]), ...facts(labels[place]));
+      if (place >= 0) {
+        const [image, ...note] = picture("card", place, vertices[place]);
+        card.replaceChildren(...(image ? [image] : []), ...facts(labels[place]), ...note);
+      }
       open(place >= 0);
     }
 
