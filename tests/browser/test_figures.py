@@ -467,6 +467,7 @@ def test_choosing_a_group_opens_what_is_inside_it(sheet: Sheet) -> None:
     sheet.page.click(".group >> nth=0")
     opened = sheet.page.locator("details[open]").evaluate_all("all => all.map(each => each.dataset.group)")
     assert opened == ["before <it>"]
+    assert not sheet.has_card, "of what came under the pointer"
     inside = sheet.page.locator("details[open] svg.epypes-graph")
     inside.locator("#function-blur").click()
     assert "GaussianBlur" in sheet.page.locator("details[open] .epypes-about").inner_text()

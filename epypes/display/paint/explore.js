@@ -16,6 +16,8 @@
   const BESIDE_PX = 820;
   // After so long without a question a connection is closed: all that the kernel publishes comes over it, too.
   const IDLE_MS = 10_000;
+  // Where the pointer was on the screen at the last click.
+  let clicked = "";
 
   document.querySelectorAll("figure.epypes-figure:not([data-alive])").forEach(enliven);
 
@@ -151,7 +153,7 @@
     figure.querySelector(".epypes-stage").after(about, card);
     const picture = pictures(figure.closest(".epypes-sheet"), data.images, functions.length);
     const placeOf = (target) => vertices.indexOf(target?.closest?.(VERTEX));
-    let near = -1, chosen = -1, frame = 0, clicked = "";
+    let near = -1, chosen = -1, frame = 0;
 
     function show(place) {
       if (place === near) return;
