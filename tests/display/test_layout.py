@@ -531,3 +531,26 @@ def test_a_graph_of_200_functions_is_laid_out_once_whatever_its_values():
     for value in (2, 3, 4):
         mimebundle(ep.show(runner.rerun(k100=value), collapse=False))
     assert lay_out.cache_info().misses == 1
+
+
+def test_hyperparameters_stand_in_stacks_where_the_graph_would_be_wider_than_a_page():
+    names = {side: tuple(f"a_long_name_{side}_{index}" for index in range(4)) for side in ("left", "right")}
+    io = {side: ((f"image_{side}", *names[side]), f"result_{side}") for side in names}
+    io["meet"] = (("result_left", "result_right"), "result")
+    cg = ep.CompGraph(dict.fromkeys(io, lambda *values: 1), io)
+    runner = ep.CompGraphRunner(cg, dict.fromkeys((*names["left"], *names["right"]), 1))
+    svg = to_svg(runner)
+    at = {name: re.search(rf'id="token-{name}".*?<text [^>]*x="(\d+)" y="(\d+)"', svg) for name in names["left"]}
+    assert float(re.search(r'width="(\d+)"', svg)[1]) < 1_000
+    assert len({found[1] for found in at.values()}) == 1, "one below the other"
+    assert [int(found[2]) for found in at.values()] == sorted(int(found[2]) for found in at.values())
+
+
+def test_data_flows_straight_down_past_hyperparameters():
+    io = {f"f{index}": ((f"t{index}", f"threshold_{index}"), f"t{index + 1}") for index in range(6)}
+    runner = ep.CompGraphRunner(
+        ep.CompGraph(dict.fromkeys(io, lambda *values: 1), io), {f"threshold_{index}": 1 for index in range(6)}
+    )
+    svg = to_svg(runner)
+    middles = {re.search(rf'id="token-t{index}".*?<text [^>]*x="(\d+)"', svg)[1] for index in range(1, 7)}
+    assert len(middles) == 1

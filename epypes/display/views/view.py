@@ -20,9 +20,8 @@ from epypes.display.text import (
     overhead_text,
     short_name,
 )
-from epypes.display.views.folding import folded
 from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView, TokenState
-from epypes.display.views.groups import MOST_SHOWN, collapsed, groups_of, outside_tokens, twice_seen
+from epypes.display.views.groups import MOST_SHOWN, collapsed, folded, groups_of, outside_tokens, twice_seen
 from epypes.display.views.structure import structure_of
 from epypes.display.views.tokens import ROOM, HyperparameterValues, Room, token_views
 from epypes.errors import UnknownName, run_call
