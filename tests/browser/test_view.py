@@ -686,12 +686,12 @@ def test_history_is_gone_back_to_and_undone(view: ViewPage) -> None:
 
 def test_settings_are_saved_and_loaded_by_name(view: ViewPage) -> None:
     view.click(".epypes-save")
-    assert view.text(".epypes-setting-message") == "! Give the settings a name."
+    assert view.text(".epypes-outcome") == "! Give the settings a name."
     view.page.fill(".epypes-setting", "bright")
     view.press("Enter")
-    view.until("document.querySelector('.epypes-setting-message').textContent === 'saved bright.toml'")
+    view.until("document.querySelector('.epypes-outcome').textContent === 'saved bright.toml'")
     view.click(".epypes-load")
-    view.until("document.querySelector('.epypes-setting-message').textContent === '! There are no settings bright.'")
+    view.until("document.querySelector('.epypes-outcome').textContent === '! There are no settings bright.'")
 
 
 def test_promote_tells_its_outcome(view: ViewPage) -> None:

@@ -49,7 +49,7 @@ def test_each_control_stands_once_and_what_several_functions_take_under_a_headin
         {"css": "epypes-folder-1", "functions": ["blur", "canny"]},
         {"css": "epypes-folder-2", "functions": ["canny"]},
     )
-    assert ">shared: blur, canny</span>" in found.widget.children[2].children[0].value
+    assert ">shared: blur, canny</span>" in found.widget.children[1].children[1].children[0].value
 
 
 def test_the_page_is_told_the_hard_range_the_steps_and_the_first_values(edges: ep.CompGraphRunner) -> None:
@@ -66,7 +66,8 @@ def test_the_page_is_told_the_hard_range_the_steps_and_the_first_values(edges: e
 def test_rows_and_folders_are_found_by_their_classes(edges: ep.CompGraphRunner) -> None:
     found = listed(edges, **HINTS)
     assert "epypes-controls" in found.widget._dom_classes
-    search, blur, _shared, canny = found.widget.children
+    search, folders = found.widget.children
+    blur, _shared, canny = folders.children
     assert (search._dom_classes, search.placeholder) == (("epypes-filter",), "Filter")
     assert blur._dom_classes == ("epypes-folder", "epypes-folder-0")
     heading, border = blur.children
@@ -81,7 +82,7 @@ def test_names_with_markup_in_them_stay_names() -> None:
     cg = ep.CompGraph({"<b>f</b>": lambda x: x}, {"<b>f</b>": ("<i>x", "y")})
     (entry,) = controls(ep.CompGraphRunner(cg, {"<i>x": 5}), {})
     found = column(cg, [entry])
-    (_search, folder) = found.widget.children
+    (folder,) = found.widget.children[1].children
     assert folder.children[0].value.startswith('<span class="epypes-name">&lt;b&gt;f&lt;/b&gt;</span>')
     assert not entry.widget.description_allow_html
     assert found.folders[0]["functions"] == ["<b>f</b>"]
@@ -91,7 +92,8 @@ def test_all_controls_share_their_layout_and_their_styles(edges: ep.CompGraphRun
     made = controls(edges, HINTS)
     assert len({entry.widget.layout.model_id for entry in made}) == 1
     assert len({entry.widget.style.model_id for entry in made}) == 1
-    boxes = column(edges.cg, made).widget.children
+    search, folders = column(edges.cg, made).widget.children
+    boxes = [search, folders, *folders.children]
     assert len({box.layout.model_id for box in boxes}) == 1
 
 

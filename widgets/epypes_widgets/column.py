@@ -41,7 +41,8 @@ def column(cg: CompGraph, controls: Iterable[Control]) -> Column:
     layout, heading_style = ipywidgets.Layout(), HTMLStyle()
     text = "Show only hyperparameters with these letters in their name, function or tooltip"
     search = {"placeholder": "Filter", "tooltip": text, "continuous_update": False, "style": TextStyle()}
-    boxes: list[Any] = [ipywidgets.Text(**search, layout=layout, _dom_classes=("epypes-filter",))]
+    filter_box = ipywidgets.Text(**search, layout=layout, _dom_classes=("epypes-filter",))
+    boxes: list[Any] = []
     rows: list[dict[str, Any]] = []
     folders: list[dict[str, Any]] = []
     for functions, own in _by_functions(cg, controls):
@@ -56,7 +57,9 @@ def column(cg: CompGraph, controls: Iterable[Control]) -> Column:
         css = f"epypes-folder-{len(folders)}"
         boxes.append(ipywidgets.VBox(inside, layout=layout, _dom_classes=("epypes-folder", css)))
         folders.append({"css": css, "functions": list(functions)})
-    widget = ipywidgets.VBox(boxes, layout=layout, _dom_classes=("epypes-controls",))
+    # Folders in columns, within what scrolls.
+    inner = ipywidgets.VBox(boxes, layout=layout, _dom_classes=("epypes-folders",))
+    widget = ipywidgets.VBox([filter_box, inner], layout=layout, _dom_classes=("epypes-controls",))
     return Column(widget, tuple(rows), tuple(folders))
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # A longer text is a document, not a parameter: it would travel with every message about its box.
 _MAX_TEXT: Final = 2_000
-_DESCRIPTION_WIDTH: Final = "112px"
+_DESCRIPTION_WIDTH: Final = "42%"
 
 
 class _Quiet(ipywidgets.Widget):

@@ -2,6 +2,8 @@
 import { element, note } from "./elements.js";
 import { FAST, means, read, same, stepped, written } from "./numbers.js";
 
+/** A box grows with what is in it from this many characters on. */
+const FITTING = 7;
 const NUMBER_KEYS = { ArrowUp: 1, ArrowDown: -1, PageUp: FAST, PageDown: -FAST };
 
 /**
@@ -23,6 +25,11 @@ export function numberBox(panel, row, index) {
     if (isTyping) return;
     const text = typeof current() === "number" ? written(current()) : "";
     if (input.value !== text) input.value = text;
+    fit();
+  }
+
+  function fit() {
+    input.style.width = input.value.length > FITTING ? `calc(${input.value.length}ch + 14px)` : "";
   }
 
   function complain(problem) {
@@ -49,7 +56,7 @@ export function numberBox(panel, row, index) {
   /** Take what was typed; it stays, marked, if it can't be taken. */
   function commit() {
     if (!isTyping) return;
-    const found = read(row, index, input.validity.badInput ? "what was typed" : input.value, values());
+    const found = read(row, index, input.value, values());
     if ("problem" in found) complain(found.problem);
     else place(found.value, true);
   }
@@ -69,7 +76,10 @@ export function numberBox(panel, row, index) {
     event.stopPropagation();
   }
 
-  input.addEventListener("input", () => (isTyping = true));
+  input.addEventListener("input", () => {
+    isTyping = true;
+    fit();
+  });
   input.addEventListener("change", commit);
   input.addEventListener("blur", () => {
     commit();

@@ -63,7 +63,7 @@ export function read(row, index, text, values) {
   const name = row.names[index];
   const typed = text.trim();
   const value = Number(typed);
-  if (typed === "" || !Number.isFinite(value)) return { problem: `${name}: ${typed || "nothing"} is no number.` };
+  if (typed === "" || !Number.isFinite(value)) return { problem: `Type a number for ${name}${typed ? `, not ${typed}` : ""}.` };
   if ((row.integer || row.odd) && !Number.isInteger(value)) return { problem: `${name} takes whole numbers, not ${typed}.` };
   const { low, high } = ends(row, index, values);
   const asked = row.odd ? asKind(row, value) : value;

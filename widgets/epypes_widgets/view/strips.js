@@ -167,7 +167,8 @@ export function historyPart(panel) {
   function make(entry, bytes) {
     const name = entry.label || `#${entry.number}`;
     const text = entry.changed || "start";
-    const attributes = { "data-number": entry.number, "aria-label": `Go to ${name}: ${text}`, title: `${name}: ${text}`, "aria-current": Boolean(entry.current) };
+    const whole = `${name}: ${entry.about || text}`;
+    const attributes = { "data-number": entry.number, "aria-label": `Go to ${whole}`, title: whole, "aria-current": Boolean(entry.current) };
     const { img, node } = small(attributes, () => panel.send({ kind: "goto", number: entry.number }), element("b", "", {}, name), ` ${text}`);
     const shown = images.get(entry.number) ?? img;
     img.replaceWith(shown);
