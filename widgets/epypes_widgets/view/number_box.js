@@ -13,7 +13,7 @@ const NUMBER_KEYS = { ArrowUp: 1, ArrowDown: -1, PageUp: FAST, PageDown: -FAST }
 export function numberBox(panel, row, index) {
   const name = row.names[index];
   const label = `${name}${row.unit ? ` in ${row.unit}` : ""}`;
-  const input = element("input", "epypes-number", { type: "number", step: "any", "aria-label": label, "data-name": name, title: row.tip });
+  const input = element("input", "epypes-number", { type: "text", inputmode: "decimal", autocomplete: "off", "aria-label": label, "data-name": name, title: row.tip });
   let position = row.value[index];
   let exact = position;
   let isTyping = false;
@@ -85,7 +85,6 @@ export function numberBox(panel, row, index) {
     commit();
     panel.commit();
   });
-  input.addEventListener("wheel", (event) => document.activeElement === input && event.preventDefault(), { passive: false });
   input.addEventListener("keydown", onKey);
   show();
 
