@@ -509,13 +509,13 @@ def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
             continue
         names = tuple(along.name for along in pairs[token]) if token in pairs else (token,)
         tips = {name: tooltip(runner.cg, name, params[name]) for name in names}
+        text = tips[token] if len(names) == 1 else "\n".join(f"{name}: {tip}" for name, tip in tips.items() if tip)
         if token in pairs:
-            text = "\n".join(f"{name}: {tip}" for name, tip in tips.items())
             both, firsts = tuple(values[name] for name in names), tuple(first.get(name) for name in names)
             control: Control = RangeControl(pairs[token], both, firsts, appearance.of(names, text, SliderStyle))
         else:
-            control = _single(token, values[token], param, first.get(token), tips[token], appearance)
-        control.tip = "\n".join(tips.values())
+            control = _single(token, values[token], param, first.get(token), text, appearance)
+        control.tip = text
         made |= dict.fromkeys(names, control)
     return tuple(dict.fromkeys(made.values()))
 

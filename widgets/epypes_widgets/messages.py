@@ -52,6 +52,7 @@ class Messages:
         tuning, screen = self._tuning, self._screen
         return {
             "ready": self._ready,
+            "ping": lambda _: screen.view.tell("pong", {}),
             "seen": lambda _: tuning.seen(),
             "left": self._left,
             "hold": lambda message: tuning.controls.hold(message["names"]),

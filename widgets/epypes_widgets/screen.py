@@ -21,7 +21,7 @@ from epypes_widgets.view import PictureView
 _MAX_ENTRIES: Final = 40
 _MAX_LINES: Final = 100
 _MOST_CHANGES: Final = 20
-_LINE_CHARACTERS: Final = 500
+_LINE_CHARACTERS: Final = 2_000
 _ERROR_CHARACTERS: Final = 2_000
 
 

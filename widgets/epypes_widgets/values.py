@@ -171,9 +171,11 @@ def json_value(value: Any) -> Any:
     if isinstance(value, enum.Enum):
         return value.name
     try:
-        if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        if is_truth(value):
+            return bool(value)
+        if isinstance(value, numbers.Integral):
             value = int(value) if abs(int(value)) <= _LARGEST_IN_JSON else short_repr(value)
-        elif isinstance(value, numbers.Real) and not isinstance(value, bool):
+        elif isinstance(value, numbers.Real):
             value = _shortest(value)
         elif isinstance(value, tuple | list) and len(value) > _MAX_ITEMS:
             return short_repr(value)
