@@ -67,13 +67,17 @@ class StaticOutput:
     Parameters
     ----------
     html
-        Returns what it shows now.
+        Returns what it shows now, below the line on the kernel that is gone.
     """
 
     def __init__(self, html: Callable[[], str]) -> None:
-        self.html = lambda: f'<div class="epypes-kept">{_ENDED}{html()}</div>'
+        self._html = html
         self._handle: Any = None
         self._shown = ""
+
+    def html(self) -> str:
+        """Return what it shows now."""
+        return f'<div class="epypes-kept">{_ENDED}{self._html()}</div>'
 
     def display(self) -> None:
         """Show it below the outputs of the running cell."""
