@@ -114,3 +114,24 @@ def test_a_notebook_that_is_opened_again_shows_the_picture_and_the_line_and_no_e
             )
         assert "model not found" not in again.page.locator(".jp-Notebook").inner_text()
         again.close()
+
+
+def test_where_the_models_are_saved_too_the_picture_is_shown_and_no_panel_that_is_dead(
+    lab_page: Any, notebook: Notebook, lab: JupyterLab
+) -> None:
+    # As nbconvert saves what it has executed.
+    state = notebook.execute("import ipywidgets, json; print(json.dumps(ipywidgets.Widget.get_manager_state()))")
+    notebook.page.evaluate(
+        "state => jupyterapp.shell.currentWidget.context.model.setMetadata('widgets',"
+        " { 'application/vnd.jupyter.widget-state+json': JSON.parse(state) })",
+        state,
+    )
+    notebook.save()
+    shutil.copy(lab.root / "ended.ipynb", lab.root / "with models.ipynb")
+    again = Notebook(lab_page, "with models.ipynb", 1440, 900)
+    again.page.locator(".epypes-kept img").scroll_into_view_if_needed()
+    again.page.wait_for_function("() => document.querySelector('.epypes-void')")
+    assert again.page.locator(".epypes-kept img").is_visible()
+    assert ENDED in again.page.locator(".epypes-kept").inner_text()
+    assert not again.page.locator(".epypes-panel").is_visible()
+    again.close()
