@@ -31,6 +31,7 @@ panel = tune(runner)
 panel
 """
 RESTARTED = "The kernel was restarted: run this cell again."
+KEPT = "Kept from the last run: run this cell again to go on."
 ENDED = "The kernel of this panel has ended: run this cell again."
 CONTEXT = "jupyterapp.shell.currentWidget.sessionContext"
 # What ipywidgets draws on a part whose kernel is gone.
@@ -106,7 +107,7 @@ def test_a_notebook_that_is_opened_again_shows_the_picture_and_the_line_and_no_e
         kept = again.page.locator(".epypes-kept")
         kept.scroll_into_view_if_needed()
         assert kept.locator("img").evaluate("async img => { await img.decode(); return img.naturalWidth; }") > 200
-        assert ENDED in kept.inner_text()
+        assert KEPT in kept.inner_text()
         assert "66" in kept.inner_text()
         if name == "opened.ipynb":  # what it can't find a model for is not even shown in an other notebook
             again.page.wait_for_function(
@@ -132,6 +133,6 @@ def test_where_the_models_are_saved_too_the_picture_is_shown_and_no_panel_that_i
     again.page.locator(".epypes-kept img").scroll_into_view_if_needed()
     again.page.wait_for_function("() => document.querySelector('.epypes-void')")
     assert again.page.locator(".epypes-kept img").is_visible()
-    assert ENDED in again.page.locator(".epypes-kept").inner_text()
+    assert KEPT in again.page.locator(".epypes-kept").inner_text()
     assert not again.page.locator(".epypes-panel").is_visible()
     again.close()

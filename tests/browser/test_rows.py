@@ -115,6 +115,17 @@ def test_names_are_whole_and_sliders_wide(notebook: Notebook, panel: PanelOnScre
     panel.page.set_viewport_size({"width": 1440, "height": 900})
 
 
+def test_picture_save_and_promote_are_on_the_screen_together(panel: PanelOnScreen) -> None:
+    panel.page.locator(".epypes-panel").evaluate("panel => panel.scrollIntoView()")
+    top, end = panel.page.locator(".jp-WindowedPanel-outer").evaluate(
+        "outer => [outer.getBoundingClientRect().top, outer.getBoundingClientRect().bottom]"
+    )
+    for css in (".epypes-bar", ".epypes-box", ".epypes-save", ".epypes-promote"):
+        place = panel.page.locator(css).bounding_box()
+        assert top <= place["y"] + 1
+        assert place["y"] + place["height"] <= end
+
+
 def test_what_two_functions_take_has_a_heading_of_its_own(panel: PanelOnScreen) -> None:
     headings = panel.page.locator(".epypes-heading .epypes-name").all_text_contents()
     assert headings == ["above", "inverted", "shared: inverted, within", "within"]

@@ -67,7 +67,7 @@ def _by_functions(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[
     """Yield controls by the functions that take them, in run order of the first; its own come before shared ones."""
     folders: dict[tuple[str, ...], list[Control]] = {}
     for control in controls:
-        folders.setdefault(tuple(cg.digraph.consumers[control.names[0]]), []).append(control)
+        folders.setdefault(tuple(dict.fromkeys(cg.digraph.consumers[control.names[0]])), []).append(control)
     places = {function: place for place, function in enumerate(cg.functions)}
     yield from sorted(folders.items(), key=lambda folder: (places[folder[0][0]], len(folder[0])))
 

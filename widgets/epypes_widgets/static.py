@@ -31,10 +31,11 @@ _CELL_ROOM: Final = 80
 _TEXT_ROOM: Final = 800
 # Within the picture, since an output cuts off what is around it.
 _FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outline-offset:-1px"
-_ENDED: Final = (
+# True also where the panel lives and this can't be hidden, as in VS Code.
+_KEPT: Final = (
     "<style>.jp-OutputArea-child:not(:has(.epypes-view:not(.epypes-void), .epypes-picker))"
     ":has(+ .jp-OutputArea-child .epypes-kept) {display: none}</style>"
-    '<p style="margin:0 0 8px">The kernel of this panel has ended: run this cell again.</p>'
+    '<p style="margin:0 0 8px">Kept from the last run: run this cell again to go on.</p>'
 )
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
 
@@ -67,7 +68,7 @@ class StaticOutput:
     Parameters
     ----------
     html
-        Returns what it shows now, below the line on the kernel that is gone.
+        Returns what it shows now, below a line on what to do.
     """
 
     def __init__(self, html: Callable[[], str]) -> None:
@@ -77,7 +78,7 @@ class StaticOutput:
 
     def html(self) -> str:
         """Return what it shows now."""
-        return f'<div class="epypes-kept">{_ENDED}{self._html()}</div>'
+        return f'<div class="epypes-kept">{_KEPT}{self._html()}</div>'
 
     def display(self) -> None:
         """Show it below the outputs of the running cell."""
