@@ -20,6 +20,8 @@ import numpy as np, epypes as ep
 from epypes_widgets import tune
 
 def above(image, threshold=100):
+    if threshold == 13:
+        raise ValueError("13 is no threshold")
     return image > threshold
 
 image = np.add.outer(np.arange(200), np.arange(255)).astype(np.uint8)
@@ -61,6 +63,8 @@ def check_ended(panel: PanelOnScreen, text: str) -> None:
 
 def test_after_a_restart_the_panel_says_so_and_runs_again_with_its_cell(notebook: Notebook) -> None:
     panel = PanelOnScreen(notebook)
+    assert notebook.execute("panel['threshold'] = 13; panel.wait(60)") == ""
+    panel.wait_for_status("13 is no threshold")
     notebook.page.evaluate(f"() => {CONTEXT}.restartKernel()")
     check_ended(panel, RESTARTED)
     for theme in notebook.each_theme():

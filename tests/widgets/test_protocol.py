@@ -503,6 +503,10 @@ def test_the_first_values_can_be_gone_back_to_from_what_fails_on_them(panel: Pan
     panel.wait(60)
     front_end.wait_for_values(10, threshold=100)
     assert (panel["threshold"], front_end.last("history")["undo"]) == (100, False)
+    for threshold in (13, 100):
+        front_end.tell("set", values={"threshold": threshold})
+        panel.wait(60)
+    assert not front_end.last("history")["undo"]
 
 
 def test_what_is_compared_with_follows_the_stage_while_a_run_fails(panel: Panel, front_end: FrontEnd) -> None:

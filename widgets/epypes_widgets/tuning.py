@@ -265,8 +265,11 @@ class Tuning:
             self._commits |= commits
             self._fail(run, run.failure)
         else:
+            had_failed = bool(self.screen.error)
             self.screen.follow(run)
             self.screen.show(run, changed_ns)
+            if had_failed:  # there is nothing left that could be undone
+                self.screen.send_history()
             self._show_notice()
             if not is_settled:
                 self.session.insist()
@@ -338,9 +341,9 @@ class Tuning:
         good = self.session.result
         if good is not None:
             self.screen.show(good, 0, failed=run)
-        is_news = not self.screen.error
+        had_failed = bool(self.screen.error)
         self.screen.fail(str(failure), failure.function, self._at_fault(run, failure.function))
-        if is_news and self.screen.is_beyond:  # what failed can be undone
+        if not had_failed:  # what failed can be undone
             self.screen.send_history()
 
     def _at_fault(self, run: Run, function: str) -> list[str]:

@@ -189,6 +189,7 @@ function render({ model, el }) {
     figure.classList.toggle("epypes-void", stage.picture.hidden && stage.text.hidden);
     if (given) setup({ ...given.message, closed: true }, given.buffers);
     stage.wait("");
+    header.failure(null);
     header.tell(text);
   }
 
