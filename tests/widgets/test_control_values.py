@@ -410,6 +410,6 @@ def test_a_truth_value_of_numpy_has_a_tick_box(value: Any) -> None:
 
 
 def test_numbers_and_truth_values_of_numpy_are_written_as_short_as_they_are() -> None:
-    runner = runner_of(x=np.float32(0.3), y=np.bool_(True))
+    runner = runner_of(x=np.float32(0.3), is_on=np.bool_(True))
     assert [row["default"] for row in column(runner.cg, controls(runner, {})).rows] == [[0.3], [True]]
     assert at(made(np.float32(0.3))).dtype == np.float32
