@@ -169,7 +169,7 @@ export function historyPart(panel) {
   function caption(name, text) {
     const [, changed, values] = ONE_CHANGE.exec(text) ?? [];
     const title = element("b", "", {}, name);
-    return changed ? [element("span", "epypes-name", {}, title, ` ${changed}`), values] : [title, ` ${text}`];
+    return changed ? [element("span", "epypes-name", {}, title, ` ${changed}`), ` ${values}`] : [title, ` ${text}`];
   }
 
   function make(entry, bytes) {
