@@ -192,6 +192,7 @@ class _Answering(_Reactive):
 
     def emit(self, event: Any, run: Run) -> None:
         """Put what f_out makes of the event's run on q_out. The hook for subclasses."""
+        __tracebackhide__ = True
         view = self._events.get(get_ident())
         if view is None or view.event is not event:
             view = EventView(self.name, event, "f_out")
@@ -239,10 +240,11 @@ class SourcePipeline(_Answering):
         self.q_out, self.f_out = q_out, f_out
         self._events = {}
 
-    def run(self, /, **payload: Any) -> Run:
+    def run(self, /, *positional: Any, **payload: Any) -> Run:
         """Run the graph on a payload and put the result on q_out."""
+        __tracebackhide__ = True
         view = EventView(self.name, None, "f_out")
-        run = super().run(**payload)
+        run = super().run(*positional, **payload)
         # Only now: the graph may run this pipeline itself, on this thread.
         self._events[get_ident()] = view
         try:
