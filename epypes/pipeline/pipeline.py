@@ -189,6 +189,10 @@ class Pipeline(Node, TokenMapping):
         """Return what is called with each event: without f_in the event is the only input."""
         return self if f_in is None else lambda event: self.run(**f_in(event))
 
+    def _take_failure(self, event: Any, exception: BaseException, *, is_reported: bool) -> bool:
+        """Count an event whose reaction raised, and report it unless the loop does; return whether that was done."""
+        return False
+
     def _has_settled(self, event: Any) -> bool:
         """Whether the pipeline has acknowledged or rejected the event itself."""
         return False

@@ -29,17 +29,17 @@ _WAS_IT_FOUND: Final = "Was the file found? cv2.imread returns None for a file t
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A function that raised, or a reactive pipeline's f_in, f_out or compute.
+    """A function that raised, or a reactive pipeline's f_in, f_out, or hook of its own.
 
     Attributes
     ----------
     function
         Its name in the graph; ``"f_in"`` also for a payload that the graph refuses, ``"f_out"`` also for the put of the
-        answer, ``"compute"`` for what a subclass does around its graph.
+        answer. ``"compute"``, ``"emit"``, ``"put"`` and ``"handle"`` are hooks of a subclass.
     tokens
         Its input tokens, then its output tokens.
     inputs
-        The values that it was called with, by token; by ``"event"`` for f_in and compute.
+        The values that it was called with, by token; by ``"event"`` for f_in, compute and handle.
     exception
         What it raised, unchanged.
     event_id
