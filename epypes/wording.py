@@ -9,6 +9,8 @@ from typing import Final
 _OPENCV_PLACE: Final = re.compile(r"OpenCV\([^)\n]*\) [^\n]*?:-?\d+: error: ")
 # The name of a template, with all its parameters.
 _OPENCV_TEMPLATE: Final = re.compile(r" in function '[^']{60,}'")
+# In the link to the page of a service, its present and its former name.
+_ACCESS_KEY: Final = re.compile(r"([?&#](?:access_key|token)=)[^&#\s'\"]+")
 
 
 def counted(count: int, noun: str) -> str:
@@ -20,6 +22,11 @@ def ended(text: str) -> str:
     """Return a text with a full stop, unless it has an end of its own: what an exception says may be a sentence."""
     text = text.rstrip()
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def without_access_key(text: str) -> str:
+    """Return a text without the access key in the link to a service's page."""
+    return _ACCESS_KEY.sub(r"\1...", text)
 
 
 def error_message(error: BaseException) -> str:

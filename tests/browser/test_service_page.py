@@ -104,7 +104,7 @@ def home(tmp_path_factory):
 @pytest.fixture(scope="module")
 def served(bundle, photograph, home):
     with Service(bundle) as service, HttpServer(service, "127.0.0.1:*") as http, peer_of(service) as peer:
-        http.token, http.failures = http.token_file.read_text().strip(), service.info()["addresses"]["failures"]
+        http.token, http.failures = http.access_key_file.read_text().strip(), service.info()["addresses"]["failures"]
         with Line(service, peer, photograph) as line:
             yield service, http, line
 
@@ -248,7 +248,7 @@ def test_a_number_that_is_whole_and_may_have_a_fraction_is_given_one(browser, bu
     (folder / "pipeline.toml").write_text(text)
     write_manifest(folder)
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
-        http.token = http.token_file.read_text().strip()
+        http.token = http.access_key_file.read_text().strip()
         with page_of(browser, http) as page:
             page.wait_for_function("() => document.getElementById('graph-note').textContent.startsWith('Waiting for')")
             address = service.info()["addresses"]["sub"]
@@ -333,7 +333,7 @@ def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_pau
 def test_values_are_written_back_after_their_difference_was_seen(browser, bundle, photograph, home, tmp_path):
     folder = shutil.copytree(bundle, tmp_path / "edges")
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
-        http.token = http.token_file.read_text().strip()
+        http.token = http.access_key_file.read_text().strip()
         change(http, canny_lo=64)
         with page_of(browser, http) as page:
             page.locator("#write-back:enabled").click()

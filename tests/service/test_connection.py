@@ -118,7 +118,7 @@ def test_the_token_is_taken_from_the_address_the_environment_or_the_state_of_the
     from epypes.service.state_file import ServiceState
 
     with StateLock(service.folder) as lock:
-        state = ServiceState(1, "tcp://a", "tcp://b", "d", http=server.url, token_file=str(server.token_file))
+        state = ServiceState(1, "tcp://a", "tcp://b", "d", http=server.url, access_key_file=str(server.access_key_file))
         lock.publish(state)
         with ep.connect(server.url) as connection:
             assert connection.set(canny_lo=62).revision == 3

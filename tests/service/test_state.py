@@ -414,7 +414,7 @@ def stateful_source_that_dies_at(before):
 def test_a_panel_on_a_service_tries_values_on_the_last_event_with_its_state(adding):
     with serving(adding) as (service, peer), HttpServer(service, "127.0.0.1:0") as server:
         assert sums(peer, 1, 2, 3) == [1, 3, 6]
-        with ep.connect(server.url, token=server.token_file.read_text().strip()) as connection:
+        with ep.connect(server.url, token=server.access_key_file.read_text().strip()) as connection:
             runner = connection.to_tune()
             assert dict(runner.cg.delays) == {"before": ("total", None)}
             assert runner.free_source_tokens == ("what", "number")

@@ -114,7 +114,7 @@ def test_pause_and_resume_say_what_they_did(changing):
 def test_parameters_are_written_back_after_a_look_at_what_would_change(edge_bundle, tmp_path):
     folder = shutil.copytree(edge_bundle.path, tmp_path / "edges")
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
-        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        headers = {"Authorization": f"Bearer {http.access_key_file.read_text().strip()}"}
         with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
             client.patch("/v1/parameters", json={"values": {"lo": 64}})
             would = client.post("/v1/parameters/write-back", json={"dry_run": True}).json()
@@ -212,7 +212,7 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
     )
     write_manifest(waiting)
     with Service(slow) as service, HttpServer(service, "127.0.0.1:*") as http:
-        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        headers = {"Authorization": f"Bearer {http.access_key_file.read_text().strip()}"}
         with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
             answers = []
             first = threading.Thread(

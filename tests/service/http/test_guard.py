@@ -42,7 +42,7 @@ def test_a_change_without_the_token_is_refused_and_says_where_it_is(client, http
     answer = client.request(method, path, json={})
     assert answer.status_code == 401
     assert answer.headers["www-authenticate"].startswith("Bearer")
-    assert str(http.token_file) in sentence(answer)
+    assert str(http.access_key_file) in sentence(answer)
 
 
 @pytest.mark.parametrize(("method", "path"), CHANGES)
