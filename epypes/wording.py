@@ -41,7 +41,8 @@ def error_message(error: BaseException) -> str:
         return text
     lines = _OPENCV_TEMPLATE.sub("", text[place.end() :]).splitlines()
     # One reason for each overload, which are often the same.
-    return " ".join(dict.fromkeys(line.strip("> ") for line in lines))
+    reasons = dict.fromkeys(line.strip("> ") for line in lines)
+    return " ".join(f"{line[2:]};" if line.startswith("- ") else line for line in reasons).rstrip(";")
 
 
 def keep_as_state(name: str, initial: str = "None", *, is_object: bool = False) -> str:

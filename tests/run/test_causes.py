@@ -96,7 +96,10 @@ def test_what_is_only_unusual_is_no_cause(edge_runner, photograph):
     [
         (lambda image: cv2.GaussianBlur(image, (4, 4), 0), "(-215:Assertion failed) ksize"),
         (lambda image: cv2.cvtColor(image[..., 0], cv2.COLOR_BGR2GRAY), "Invalid number of channels in input image:"),
-        (lambda image: cv2.Canny(image, "low", 3), "(-5:Bad argument) in function 'Canny' Overload resolution failed:"),
+        (
+            lambda image: cv2.Canny(image, "low", 3),
+            "failed: Argument 'threshold1' can not be treated as a double; Canny() missing",
+        ),
     ],
     ids=["assertion", "channels", "overloads"],
 )

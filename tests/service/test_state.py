@@ -442,7 +442,7 @@ def test_the_commands_show_and_reset_the_state(adding, tenfold, epypes):
         assert "state between events kept." in deployed
         assert epypes("call", tenfold, 'what="plain"', "number=1").stdout.startswith("out = 70")
         assert "events reset." in epypes("rollback", "--http", state.http, "--state", "reset").stdout
-        with ep.connect(state.http, token="wrong") as stranger, pytest.raises(ServiceError, match="token"):
+        with ep.connect(state.http, token="wrong") as stranger, pytest.raises(ServiceError, match="access key"):
             stranger.reset()
         with ep.connect(state.http) as connection:
             assert connection.reset()["states"]["count"] == 0

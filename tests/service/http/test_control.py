@@ -146,8 +146,8 @@ def changed(edge_bundle, tmp_path):
 
 @pytest.fixture
 def epypes(epypes, monkeypatch, http):
-    """The commands, with the token of the service."""
-    monkeypatch.setenv("EPYPES_TOKEN", http.token)
+    """The commands, with the access key of the service."""
+    monkeypatch.setenv("EPYPES_ACCESS_KEY", http.token)
     return epypes
 
 
@@ -199,7 +199,13 @@ def test_without_a_service_or_its_token_nothing_is_deployed(epypes, http, edge_b
     (tmp_path / "token").write_text("x" * 43)
     done = epypes("deploy", edge_bundle.path, "--http", http.url, "--token-file", tmp_path / "token")
     assert done.returncode == 1
-    assert "token" in done.stderr
+    assert "access key" in done.stderr
+    done = epypes("deploy", edge_bundle.path, "--http", f"{http.url}/?access_key={'x' * 43}")
+    assert done.returncode == 1
+    assert "xxx" not in done.stderr
+    (tmp_path / "token").write_text(http.token)
+    done = epypes("deploy", tmp_path / "none", "--http", http.url, "--access-key-file", tmp_path / "token")
+    assert "is no folder" in done.stderr
 
 
 @pytest.mark.slow
