@@ -128,7 +128,7 @@ def _causes(tokens: TokenManager, place: int, exception: BaseException, frozen: 
             maker = program.makers[slot]
             made = f", made by function {program.steps[maker].name!r}" if maker >= 0 else ""
             yield f"{token} is None{made}. {_WAS_IT_FOUND}"
-        elif type(value) in _NUMBERS or is_numpy_scalar(type(value)):
+        elif value is not None and (type(value) in _NUMBERS or is_numpy_scalar(type(value))):
             reason = reason_against(program.cg, step.name, token, value)
             if reason:
                 yield f"{token}{_brief(value)}: {reason}."
