@@ -12,11 +12,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+# First, since an import of a module of display that Ctrl-C has ended could not be repeated otherwise.
+from epypes.display import is_image
 from epypes.display.paint.vertices import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews import THUMBNAIL_PX, Look, Sketch
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.encoding import encode_small
-from epypes.display.previews.images import image_kind, is_image, sampled, sole_value
+from epypes.display.previews.images import image_kind, sampled, sole_value
 from epypes.display.previews.preview import finished, looked_closer, sketch
 from epypes.display.previews.short import float_text
 from epypes.display.text import escape, fitted

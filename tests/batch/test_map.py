@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -350,3 +352,27 @@ def test_a_stored_outcome_still_says_that_nothing_was_found(tmp_path):
     first, again = (ep.map(runner, images, store=tmp_path / "results.db", name="peaks") for _ in range(2))
     assert [outcome.nothing for outcome in again] == [outcome.nothing for outcome in first] == [("peak",), ()]
     assert values(again, "peak") == [None, 200]
+
+
+@pytest.mark.slow  # another interpreter
+@pytest.mark.parametrize("module", ["page", "vertices", "style"])
+def test_an_import_that_ctrl_c_has_ended_can_be_repeated(module):
+    program = f"""
+import sys
+
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == "epypes.display.paint.{module}" and self in sys.meta_path:
+            sys.meta_path.remove(self)
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, CtrlC())
+import epypes as ep
+
+try:
+    ep.map
+except KeyboardInterrupt:
+    print(ep.map.__name__)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("map_images\n", "")
