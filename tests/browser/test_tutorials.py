@@ -25,7 +25,7 @@ def wait_until_drawn(notebook: Notebook) -> None:
     notebook.page.wait_for_function(
         """() => {
             const figures = [...document.querySelectorAll('figure.epypes-figure')];
-            return figures.length && figures.every(each => each.querySelector('svg.epypes-graph'));
+            return figures.length && figures.every(each => each.querySelector('svg'));
         }"""
     )
     assert not notebook.page_errors
