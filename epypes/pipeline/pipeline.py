@@ -122,6 +122,11 @@ class Pipeline(Node, TokenMapping):
         return self.runner.revision, *self.runner._program.revisions(around)
 
     @property
+    def __epypes_runner__(self) -> CompGraphRunner:
+        """The runner, for the graph that the pipeline is a function of."""
+        return self.runner
+
+    @property
     def __epypes_initial_state__(self) -> Mapping[str, Any]:
         """The state between runs before the first one; empty without any."""
         return {slots.key: slots.initial for slots in self.runner._program.states}

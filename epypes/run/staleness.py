@@ -153,7 +153,7 @@ class TokenManager(OldNames):
             renewed = zip(program.revised, self.revisions, branch.revisions, strict=True)
             places = {place for place, before, now in renewed if before != now}
             branch.dirty = branch.origin = bytes(at in places or is_dirty for at, is_dirty in enumerate(self.dirty))
-        slots = program.slots
+        slots = program.settable
         if not are_new:
             old = {token: values[slots[token]] for token in changes}
             is_new = [not is_unchanged(old[token], value, (), program.guard) for token, value in changes.items()]
@@ -167,7 +167,7 @@ class TokenManager(OldNames):
         """Make what reads a changed token dirty; return these tokens, whose steps can be run now."""
         self.dirty, self._new = bytearray(self.dirty), set()
         for token in self.changed:
-            self._mark(self.program.slots[token])
+            self._mark(self.program.settable[token])
         return self
 
     def store(self, step: Step, made: Sequence[Any] | None) -> None:
@@ -195,8 +195,11 @@ class TokenManager(OldNames):
         program = self.program
         self._new.add(slot)
         for place in program.consumers[slot]:
-            if not program.switches or slot in program.read_by(program.steps[place], self.values):
+            step = program.steps[place]
+            if step.switch is None or slot in program.read_by(step, self.values):
                 self.dirty[place] = 1
+        for run in program.forgets.get(slot, ()) if program.forgets else ():
+            self.values[run] = NOT_COMPUTED
 
     def forget(self, steps: Iterable[int]) -> None:
         """Make the outputs of these steps read as not computed."""
