@@ -34,7 +34,7 @@ from epypes.run.guard import (
     lend,
 )
 from epypes.run.program import Program, Step
-from epypes.run.staleness import NOT_COMPUTED, TokenManager, is_unchanged
+from epypes.run.staleness import TokenManager, is_unchanged, with_new_input
 from epypes.run.timing import longest_path_ns
 
 # Runs steps, and writes nanoseconds by step. What a step raises is raised; it is the step ``tokens.running``.
@@ -181,7 +181,7 @@ _NAMES: Final = {
     "go_on": go_on_one_by_one,
     "Nothing": Nothing,
     "NothingGiven": NothingGiven,
-    "NOT_COMPUTED": NOT_COMPUTED,
+    "with_new_input": with_new_input,
 }
 _FREQUENT: Final = ("clock", "kind", "count", "array", "HARMLESS")
 
@@ -235,7 +235,7 @@ class _Source:
             "        start = 0; v = t.values; d = t.durations_ns",
             "        D = t.dirty = bytearray(dirty)" if self._has_flags else "        t.dirty = dirty",
             "        try:",
-            *(f"            {line}" for slot in sorted(self._changed) for line in self._forget(slot)),
+            *(f"            {line}" for slot in sorted(self._changed) for line in self._renew(slot)),
             *(f"            {line}" for line in self._lend_sources()),
             *(f"            {line}" for step in self._steps for line in self._step(step)),
             "            t.dirty = left" if self._is_known else "            pass",
@@ -284,7 +284,7 @@ class _Source:
                     f"if c{slot}:",
                     f"    v[{slot}] = m{place}",
                 ]
-                lines += (f"    {line}" for line in self._forget(slot))
+                lines += (f"    {line}" for line in self._renew(slot))
                 if self._has_flags:
                     lines.append(f"    {' = '.join(f'D[{reader}]' for reader in self._program.consumers[slot])} = 1")
             else:
@@ -299,9 +299,9 @@ class _Source:
         yield from lines
         self._known.update(checked)
 
-    def _forget(self, slot: int) -> list[str]:
-        """Write out that nested pipelines forget their Runs, since a slot has a new value."""
-        return [f"v[{run}] = NOT_COMPUTED" for run in self._program.forgets.get(slot, ())]
+    def _renew(self, slot: int) -> list[str]:
+        """Write out that nested pipelines have a new input."""
+        return [f"v[{run}] = with_new_input(v[{run}], {slot})" for run in self._program.inside.get(slot, ())]
 
     def _given(self, step: Step) -> str:
         """Write out the values that a step read and that are not new; none if it is not known what was new to it."""

@@ -2,17 +2,17 @@
 
 The graph around a pipeline keeps for it, in slots of its own, the hyperparameters, the state between runs and the Run.
 So runs in several threads, and several graphs with one pipeline, never see each other's values; what the pipeline has
-itself stays as it is. A call that gets the same inputs as the one before runs what is stale inside, and nothing else.
+itself stays as it is. A call runs what is stale inside since the one before, and nothing else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
 from epypes.run.program import CALL_WITH_STATE, NestedSlots, Step
-from epypes.run.staleness import NOT_COMPUTED
+from epypes.run.staleness import NOT_COMPUTED, NestedRun
 
 if TYPE_CHECKING:
     from epypes.run.hyperparameters import Hyperparameters
@@ -29,15 +29,19 @@ class Loan:
     inputs
         What the pipeline is called with. A subclass may give its graph something else.
     before
-        The run with the same inputs that is gone on from, if there is one.
+        The run of the call before, if there is one to go on from.
+    new
+        Where the inputs stand that are new since then.
     run
         The last run that was made, if it was with these inputs.
     """
 
-    __slots__ = ("before", "hparams", "inputs", "run")
+    __slots__ = ("before", "hparams", "inputs", "new", "run")
 
-    def __init__(self, hparams: Hyperparameters, inputs: tuple[Any, ...], before: Run | None) -> None:
-        self.hparams, self.inputs, self.before = hparams, inputs, before
+    def __init__(
+        self, hparams: Hyperparameters, inputs: tuple[Any, ...], before: Run | None, new: Sequence[int]
+    ) -> None:
+        self.hparams, self.inputs, self.before, self.new = hparams, inputs, before, new
         self.run: Run | None = None
 
     def is_passed_on(self, payload: Mapping[str, Any]) -> bool:
@@ -49,10 +53,12 @@ class Loan:
 def call_nested(step: Step, nested: NestedSlots, values: list[Any], *args: Any) -> Any:
     """Call a pipeline; return its value, and after it the states that it leaves. Its Run is stored, a failed one too."""
     runner, keys, before = nested.runner, nested.keys, values[nested.run]
-    count = len(args) - len(keys)
+    count, is_known = len(args) - len(keys), type(before) is NestedRun
+    new = [place for place, slot in enumerate(step.inputs) if slot in before.new] if is_known else []
+    is_known = is_known and all(place < count for place in new)
     entries = {token: values[slot] for token, slot in nested.hparams.items() if values[slot] is not NOT_COMPUTED}
     hparams = runner.current.with_entries(entries)
-    loan = Loan(hparams, args[:count], None if before is NOT_COMPUTED else before)
+    loan = Loan(hparams, args[:count], before.run if is_known else None, new)
     loans, thread = runner.loans, get_ident()
     outer, loans[thread] = loans.get(thread), loan
     try:
@@ -61,7 +67,7 @@ def call_nested(step: Step, nested: NestedSlots, values: list[Any], *args: Any) 
         state = dict(zip(keys, args[count:], strict=True))
         value, after = getattr(step.function, CALL_WITH_STATE)(state, args[:count])
     finally:
-        values[nested.run] = NOT_COMPUTED if loan.run is None else loan.run
+        values[nested.run] = NOT_COMPUTED if loan.run is None else NestedRun(loan.run)
         if outer is None:
             del loans[thread]
         else:

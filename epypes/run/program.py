@@ -95,7 +95,7 @@ class NestedSlots(NamedTuple):
     hparams
         By token, the slot of its entry: a tuple of its value and its first one, which is its version.
     run
-        The slot of its Run. A new input forgets it; as long as it is there, a call goes on from it.
+        The slot of its Run, from which the next call goes on.
     keys
         Of its states, whose slots are the last ones of the step's inputs and outputs.
     single
@@ -148,8 +148,8 @@ class Program:
         The slots by token of the graph and by hyperparameter of nested pipelines.
     nested
         By function, the slots of nested pipelines.
-    forgets
-        By slot, those of the Runs of nested pipelines that are forgotten when it has a new value.
+    inside
+        By slot that nested pipelines take, the slots of their Runs.
     states
         What is kept between runs.
     steps
@@ -186,14 +186,14 @@ class Program:
         self.steps = steps = tuple(_with_nested_slots(found_steps, tokens, nested))
         self.tokens = tuple(tokens)
         self.nested = {step.name: step.nested for step in steps if step.nested is not None}
-        self.settable, self.forgets = slots, dict[int, list[int]]()
+        self.settable, self.inside = slots, dict[int, list[int]]()
         if self.nested:
-            inside = self.nested.values()
-            self.settable = slots | {each.names[token]: at for each in inside for token, at in each.hparams.items()}
+            pairs = [(each.names, each.hparams) for each in self.nested.values()]
+            self.settable = slots | {names[token]: at for names, hparams in pairs for token, at in hparams.items()}
             for step in steps:
                 if step.nested is not None:
                     for slot in dict.fromkeys(step.inputs):
-                        self.forgets.setdefault(slot, []).append(step.nested.run)
+                        self.inside.setdefault(slot, []).append(step.nested.run)
         delays = cg.delays.items()
         own = [StateSlots(token, slots[token], slots[delay.token], delay.initial) for token, delay in delays]
         self.states = tuple(

@@ -16,7 +16,7 @@ from epypes.run.guard import READ_AS_STORED, lend, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import wanted_steps
 from epypes.run.program import Program, StateSlots
-from epypes.run.staleness import NOT_COMPUTED, TokenManager
+from epypes.run.staleness import NOT_COMPUTED, NestedRun, TokenManager
 from epypes.run.timing import RunReport, Times
 from epypes.wording import counted
 
@@ -139,7 +139,7 @@ class Run(TokenMapping):
             for name, nested in program.nested.items()
             if name == failed or any(map(self.tokens.is_computed, program.cg.func_outputs(name)))
         }
-        return MappingProxyType({name: run for name, run in found.items() if isinstance(run, Run)})
+        return MappingProxyType({name: kept.run for name, kept in found.items() if type(kept) is NestedRun})
 
     @property
     def cg(self) -> CompGraph:

@@ -172,10 +172,12 @@ class CompGraphRunner(OldNames, TokenMapping):
             return self._run(hparams.tokens(payload, self._kept), hparams, targets, start_ns)
 
     def _run_lent(self, loan: Loan, payload: Payload, targets: Sequence[str], start_ns: int) -> Run:
-        """Run with what a graph has lent to the pipeline of this one; on the inputs of its last call, what is stale."""
+        """Run with what a graph has lent to the pipeline of this one, on from its last call."""
         hparams, before, is_passed_on = loan.hparams, loan.before, loan.is_passed_on(payload)
         if before is not None and is_passed_on:
-            tokens = before.tokens.branch(hparams.changes_since(before.hparams))
+            changes = dict(hparams.changes_since(before.hparams))
+            changes |= {token: value for place, (token, value) in enumerate(payload.items()) if place in loan.new}
+            tokens = before.tokens.branch(changes)
             del before
         else:
             tokens = hparams.tokens(payload, self._kept)

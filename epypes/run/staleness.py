@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from epypes.deprecation import OldNames
 from epypes.errors import NotComputed, StaleToken
@@ -18,6 +18,9 @@ from epypes.graph import CompGraph
 from epypes.nothing import Nothing, NothingType
 from epypes.run.guard import is_plain_array, is_same_guarded_array, lend_to_reader
 from epypes.run.program import Program, Step
+
+if TYPE_CHECKING:
+    from epypes.run.result import Run
 
 _SCALARS: Final = frozenset({int, float, complex, bool, type(None), NothingType})
 _TEXTS: Final = frozenset({str, bytes})
@@ -36,6 +39,18 @@ class _NotComputed:
 
 
 NOT_COMPUTED: Final = _NotComputed()
+
+
+class NestedRun(NamedTuple):
+    """The run of a nested pipeline, and the slots of its inputs that have got new values since."""
+
+    run: Run
+    new: tuple[int, ...] = ()
+
+
+def with_new_input(nested: Any, slot: int) -> Any:
+    """Note that an input of a nested pipeline has a new value, if the pipeline has run."""
+    return NestedRun(nested.run, (*nested.new, slot)) if type(nested) is NestedRun else nested
 
 
 class TokenManager(OldNames):
@@ -198,8 +213,8 @@ class TokenManager(OldNames):
             step = program.steps[place]
             if step.switch is None or slot in program.read_by(step, self.values):
                 self.dirty[place] = 1
-        for run in program.forgets.get(slot, ()) if program.forgets else ():
-            self.values[run] = NOT_COMPUTED
+        for run in program.inside.get(slot, ()) if program.inside else ():
+            self.values[run] = with_new_input(self.values[run], slot)
 
     def forget(self, steps: Iterable[int]) -> None:
         """Make the outputs of these steps read as not computed."""
