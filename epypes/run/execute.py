@@ -227,6 +227,7 @@ class _Source:
 
     def compile(self) -> Way:
         """Return the function that runs the steps."""
+        inside = self._program.inside
         lines = [
             f"def make(program, steps, {', '.join(_NAMES)}, array, dirty, left):",
             *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
@@ -235,7 +236,7 @@ class _Source:
             "        start = 0; v = t.values; d = t.durations_ns",
             "        D = t.dirty = bytearray(dirty)" if self._has_flags else "        t.dirty = dirty",
             "        try:",
-            *(f"            {line}" for slot in sorted(self._changed) for line in self._renew(slot)),
+            *(f"            {line}" for slot in (sorted(self._changed & inside.keys()) if inside else ()) for line in self._renew(slot)),
             *(f"            {line}" for line in self._lend_sources()),
             *(f"            {line}" for step in self._steps for line in self._step(step)),
             "            t.dirty = left" if self._is_known else "            pass",
@@ -284,7 +285,8 @@ class _Source:
                     f"if c{slot}:",
                     f"    v[{slot}] = m{place}",
                 ]
-                lines += (f"    {line}" for line in self._renew(slot))
+                if slot in self._program.inside:
+                    lines += (f"    {line}" for line in self._renew(slot))
                 if self._has_flags:
                     lines.append(f"    {' = '.join(f'D[{reader}]' for reader in self._program.consumers[slot])} = 1")
             else:
@@ -301,7 +303,7 @@ class _Source:
 
     def _renew(self, slot: int) -> list[str]:
         """Write out that nested pipelines have a new input."""
-        return [f"v[{run}] = with_new_input(v[{run}], {slot})" for run in self._program.inside.get(slot, ())]
+        return [f"v[{run}] = with_new_input(v[{run}], {slot})" for run in self._program.inside[slot]]
 
     def _given(self, step: Step) -> str:
         """Write out the values that a step read and that are not new; none if it is not known what was new to it."""

@@ -12,7 +12,7 @@ from threading import get_ident
 from typing import TYPE_CHECKING, Any
 
 from epypes.run.program import CALL_WITH_STATE, NestedSlots, Step
-from epypes.run.staleness import NOT_COMPUTED, NestedRun
+from epypes.run.staleness import NOT_COMPUTED, NestedRun, TokenManager
 
 if TYPE_CHECKING:
     from epypes.run.hyperparameters import Hyperparameters
@@ -74,3 +74,22 @@ def call_nested(step: Step, nested: NestedSlots, values: list[Any], *args: Any) 
             loans[thread] = outer
     is_one = nested.single or not isinstance(value, tuple | list | None)
     return *((value,) if is_one else value or ()), *(after[key] for key in keys)
+
+
+def tokens_inside(tokens: TokenManager, function: str) -> tuple[Run, TokenManager] | None:
+    """Return the run inside a pipeline, and its tokens as they are to be read with those of the graph around it."""
+    program = tokens.program
+    step = next(step for step in program.steps if step.name == function)
+    nested = step.nested
+    kept = tokens.values[nested.run] if nested is not None else None
+    if nested is None or type(kept) is not NestedRun:
+        return None
+    inner, old = nested.runner._program, kept.run.hparams.entries
+    now = {token: tokens.values[slot] for token, slot in nested.hparams.items()}
+    new = {token: entry for token, entry in now.items() if entry is not NOT_COMPUTED and entry is not old.get(token)}
+    found = kept.run.tokens.branch({token: entry[0] if token in inner.slots else entry for token, entry in new.items()})
+    found.begin()
+    for token, slot in zip(kept.run.hparams.free_slots, step.inputs, strict=False):
+        if slot in kept.new or program.makers[slot] in tokens.stale:
+            found.mark(inner.slots[token])
+    return kept.run, found

@@ -555,6 +555,11 @@ class CompGraphRunner(OldNames, TokenMapping):
                 self._hparams = self._hparams.current
             return self._hparams, self.last
 
+    @property
+    def tokens_now(self) -> TokenManager:
+        """The tokens of the last run as they are to be read with the hyperparameters of now."""
+        return self._tokens_now(*self._state)
+
     def _tokens_now(self, hparams: Hyperparameters, last: Run | None) -> TokenManager:
         """Return a run's tokens as they are to be read with these hyperparameters.
 

@@ -182,7 +182,7 @@ class TokenManager(OldNames):
         """Make what reads a changed token dirty; return these tokens, whose steps can be run now."""
         self.dirty, self._new = bytearray(self.dirty), set()
         for token in self.changed:
-            self._mark(self.program.settable[token])
+            self.mark(self.program.settable[token])
         return self
 
     def store(self, step: Step, made: Sequence[Any] | None) -> None:
@@ -203,9 +203,9 @@ class TokenManager(OldNames):
         for slot, value in zip(step.outputs, made, strict=True):
             if not is_unchanged(self.values[slot], value, given, self.program.guard):
                 self.values[slot] = value
-                self._mark(slot)
+                self.mark(slot)
 
-    def _mark(self, slot: int) -> None:
+    def mark(self, slot: int) -> None:
         """Take note that a slot has a new value: the steps that read it are dirty."""
         program = self.program
         self._new.add(slot)

@@ -21,6 +21,12 @@ from tests.properties.test_staleness import VALUES, Model, Recorded
 class Counted(Recorded):
     """A function of integers that counts its calls, and fails on some inputs."""
 
+    last = None
+
+    def __call__(self, *args):
+        self.last = args
+        return super().__call__(*args)
+
     def compute(self, *args):
         total = (self.index + 1) * 31 + sum((place + 2) * arg for place, arg in enumerate(args))
         if self.fails and total % 5 == 0:
@@ -111,6 +117,11 @@ class Machine(RuleBasedStateMachine):
         calls = {name: count - before[name] for name, count in self.calls().items()}
         if failed and self.workers > 1:
             calls = {name: count if name in called else max(count - 1, 0) for name, count in calls.items()}
+        for name in [name for name in called if not calls[name]]:
+            # A pipeline that was not called when an input changed, nor before it changed back, has missed nothing.
+            function, inputs = self.flat.functions[name], self.flat.func_inputs(name)
+            assert function.last == tuple(self.model.values[token] for token in inputs)
+            called.remove(name)
         assert calls == {name: int(name in called) for name in calls}
         self.has_run = True
         last = self.runner.last
