@@ -236,7 +236,11 @@ class _Source:
             "        start = 0; v = t.values; d = t.durations_ns",
             "        D = t.dirty = bytearray(dirty)" if self._has_flags else "        t.dirty = dirty",
             "        try:",
-            *(f"            {line}" for slot in (sorted(self._changed & inside.keys()) if inside else ()) for line in self._renew(slot)),
+            *(
+                f"            {line}"
+                for slot in (sorted(self._changed & inside.keys()) if inside else ())
+                for line in self._renew(slot)
+            ),
             *(f"            {line}" for line in self._lend_sources()),
             *(f"            {line}" for step in self._steps for line in self._step(step)),
             "            t.dirty = left" if self._is_known else "            pass",

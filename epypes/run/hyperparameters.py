@@ -82,9 +82,7 @@ class Hyperparameters:
         self._start = base, free
         return self._start
 
-    def frozen(
-        self, changes: Mapping[str, Any], *, also_new: bool = True, are_first: bool = False
-    ) -> Hyperparameters:
+    def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True, are_first: bool = False) -> Hyperparameters:
         """Return these with tokens given values; all or nothing. An equal value changes nothing.
 
         Parameters
@@ -118,7 +116,7 @@ class Hyperparameters:
                 continue
             if program.selectors:
                 self.require_branches({token: value})
-            is_nested = program.settable is not program.slots and token not in program.slots
+            is_nested = token in program.inner_names
             if is_nested:
                 self._require_nested_branches(token, value)
             if not is_count:
@@ -223,14 +221,14 @@ class Hyperparameters:
         new = [(token, entry) for token, entry in self.entries.items() if old.get(token) is not entry]
         changes = {token: entry[0] if token in slots else entry for token, entry in new}
         if self.program.nested:
-            lost = (token for token in old if token not in self.entries and token not in slots)
+            lost = (token for token in old if token in self.program.inner_names and token not in self.entries)
             changes |= dict.fromkeys(lost, NOT_COMPUTED)
         return changes
 
     def require_source(self, token: str) -> None:
         """Raise unless the token exists and no function makes it."""
         cg = self.program.cg
-        if token in self.program.settable and token not in cg.tokens:
+        if token in self.program.inner_names:
             text = f"{token!r} is free in its pipeline, not a hyperparameter. Freeze it there: pipeline.runner.freeze."
             raise HyperparameterError(token, text)
         if self.program.nested and token not in cg.tokens:

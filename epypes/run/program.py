@@ -146,6 +146,8 @@ class Program:
         The slots by token of the graph.
     settable
         The slots by token of the graph and by hyperparameter of nested pipelines.
+    inner_names
+        The hyperparameters of nested pipelines.
     nested
         By function, the slots of nested pipelines.
     inside
@@ -186,10 +188,11 @@ class Program:
         self.steps = steps = tuple(_with_nested_slots(found_steps, tokens, nested))
         self.tokens = tuple(tokens)
         self.nested = {step.name: step.nested for step in steps if step.nested is not None}
-        self.settable, self.inside = slots, dict[int, list[int]]()
+        self.settable, self.inner_names, self.inside = slots, frozenset[str](), dict[int, list[int]]()
         if self.nested:
             pairs = [(each.names, each.hparams) for each in self.nested.values()]
             self.settable = slots | {names[token]: at for names, hparams in pairs for token, at in hparams.items()}
+            self.inner_names = frozenset(self.settable) - frozenset(slots)
             for step in steps:
                 if step.nested is not None:
                     for slot in dict.fromkeys(step.inputs):
@@ -337,13 +340,13 @@ def _with_nested_slots(steps: Iterable[Step], tokens: list[str], states: list[St
         ]
         states.extend(own)
         inner = runner._program
-        # A token of the graph that is called so is not hidden.
-        names = {
-            token: name
-            for token in (*inner.cg.source_tokens, *list(inner.settable)[len(inner.slots) :])
-            if token not in inner.cg.delays and (name := f"{step.name}__{token}") not in taken
-        }
-        taken.update(names.values())
+        names = dict[str, str]()
+        for token in (*inner.cg.source_tokens, *(name for name in inner.settable if name in inner.inner_names)):
+            if token not in inner.cg.delays:
+                names[token] = f"{step.name}__{token}"
+                while names[token] in taken:  # by a token of the graph
+                    names[token] += "_"
+                taken.add(names[token])
         hparams = {token: new_slot(name) for token, name in names.items()}
         yield step._replace(
             inputs=(*step.inputs, *(state.before for state in own)),

@@ -6,8 +6,8 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from time import perf_counter_ns
 from threading import get_ident
+from time import perf_counter_ns
 from typing import Any, Final
 from weakref import ref
 
@@ -106,7 +106,10 @@ class CompGraphRunner(OldNames, TokenMapping):
         self.last: Run | None = None
         self._kept = self._initial_state()
         given = {**cg.defaults, **hparams}
-        self._hparams = Hyperparameters(self._program, {}).current.frozen(given, are_first=True)
+        inside = {token: given.pop(token) for token in [*given] if token in self._program.inner_names}
+        self._hparams = Hyperparameters(self._program, {}).frozen(given)
+        if self._program.nested:
+            self._hparams = self._hparams.current.frozen(inside, are_first=True)
 
     def _own_state(self) -> None:
         """Make what no two runners share, besides hyperparameters and the last run."""
@@ -417,7 +420,7 @@ class CompGraphRunner(OldNames, TokenMapping):
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
-        """The values of the hyperparameters by token, of pipelines in the graph by ``"function__token"``: a snapshot."""
+        """The values of the hyperparameters by token, those of pipelines by ``"function__token"``: a snapshot."""
         return self.current.values
 
     @property
@@ -584,6 +587,9 @@ class CompGraphRunner(OldNames, TokenMapping):
         if self._tokens_now(hparams, last).is_stale(token):
             raise StaleToken(token)
         return value
+
+    def __contains__(self, token: object) -> bool:
+        return isinstance(token, str) and self.cg.has_token(token) and super().__contains__(token)
 
     def __iter__(self) -> Iterator[str]:
         hparams, last = self._state

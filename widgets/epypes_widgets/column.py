@@ -62,7 +62,8 @@ def column(cg: CompGraph, controls: Iterable[Control]) -> Column:
 def _by_function(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[str, list[Control]]]:
     left = {control.names[0]: control for control in controls}
     for function, inputs in cg.digraph.inputs.items():
-        own = [left.pop(token) for token in dict.fromkeys(inputs) if token in left]
+        inside = [name for name in left if name.startswith(f"{function}__") and name not in cg.tokens]
+        own = [left.pop(token) for token in dict.fromkeys((*inputs, *inside)) if token in left]
         if own:
             yield function, own
 

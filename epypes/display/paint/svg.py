@@ -178,9 +178,7 @@ def _members(frame: FrameView, places: Mapping[str, int]) -> tuple[int, ...]:
     return tuple(places[name] for name in names if name in places)
 
 
-def _paint_inside(
-    title: str, boxes: Sequence[Box], layout: Layout, members: Sequence[int]
-) -> tuple[list[str], Bounds]:
+def _paint_inside(title: str, boxes: Sequence[Box], layout: Layout, members: Sequence[int]) -> tuple[list[str], Bounds]:
     """Paint the frame around what is inside a pipeline; return what it covers, too."""
     sizes = [(*layout.centres[at], boxes[at].width / 2 + _TITLE_PX / 2, boxes[at].height / 2) for at in members]
     frame = Bounds(

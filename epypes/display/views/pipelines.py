@@ -64,7 +64,6 @@ class Inside:
         return self.ends.get(token, f"{self.name}{_WITHIN}{token}")
 
 
-
 def insides_of(
     cg: CompGraph,
     values: Mapping[str, Any],
