@@ -103,7 +103,7 @@ def test_a_function_that_depends_on_another_input_of_the_pipeline_is_reused(coun
 
 def test_it_is_among_the_hyperparameters_of_the_runner_after_its_own(runner):
     assert dict(runner.hyperparameters) == {"gain": 1, "geometry__threshold": 2, "geometry__offset": 0}
-    assert list(runner.hyperparameters)[0] == "gain"
+    assert next(iter(runner.hyperparameters)) == "gain"
     runner["geometry__threshold"] = 5
     assert runner["geometry__threshold"] == 5
     assert runner.first_hyperparameters["geometry__threshold"] == 2

@@ -174,7 +174,7 @@ def _paint_around(graph: GraphView, layout: Layout) -> tuple[list[str], Bounds]:
 
 
 def _members(frame: FrameView, places: Mapping[str, int]) -> tuple[int, ...]:
-    names = (*(f"function {name}" for name in frame.functions), *(f"token {name}" for name in frame.tokens))
+    names = (*(f"function {name}" for name in frame.function_names), *(f"token {name}" for name in frame.token_names))
     return tuple(places[name] for name in names if name in places)
 
 

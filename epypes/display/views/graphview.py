@@ -106,8 +106,8 @@ class FrameView(NamedTuple):
     """A pipeline of which the inside is drawn: its name, and those of the functions and tokens in its frame."""
 
     name: str
-    functions: tuple[str, ...]
-    tokens: tuple[str, ...]
+    function_names: tuple[str, ...]
+    token_names: tuple[str, ...]
 
 
 class EdgeView(NamedTuple):

@@ -127,7 +127,7 @@ def opened(graph: GraphView, inside: Inside, inner: GraphView) -> GraphView:
     }
     delays = tuple((inside.shown(token), inside.shown(to)) for token, to in inner.delays)
     frame = FrameView(inside.name, tuple(each.name for each in functions), tuple(each.name for each in tokens))
-    around = tuple(_grown(each, frame) if inside.name in each.functions else each for each in graph.frames)
+    around = tuple(_grown(each, frame) if inside.name in each.function_names else each for each in graph.frames)
     return replace(
         graph,
         functions=(*graph.functions[:at], *functions, *graph.functions[at + 1 :]),
@@ -143,5 +143,5 @@ def _inner(view: View, name: str) -> View:
 
 
 def _grown(frame: FrameView, inner: FrameView) -> FrameView:
-    functions: Collection[str] = [name for name in frame.functions if name != inner.name]
-    return FrameView(frame.name, (*functions, *inner.functions), (*frame.tokens, *inner.tokens))
+    functions: Collection[str] = [name for name in frame.function_names if name != inner.name]
+    return FrameView(frame.name, (*functions, *inner.function_names), (*frame.token_names, *inner.token_names))
