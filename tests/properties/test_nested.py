@@ -239,4 +239,4 @@ def test_a_graph_with_pipelines_computes_what_the_flat_graph_does_and_nothing_ru
         Machine.workers = 2
         monkeypatch.setattr(execute, "has_independent_steps", lambda program: True)
         monkeypatch.setattr(execute.Gain, "is_worth_it", lambda self: True)
-    run_state_machine_as_test(Machine, settings=settings())
+    run_state_machine_as_test(Machine, settings=settings(max_examples=min(settings.default.max_examples, 500)))
