@@ -82,6 +82,9 @@ class Pipeline(Node, TokenMapping):
 
     Notes
     -----
+    In another graph its hyperparameters are called as in scikit-learn, ``"function__token"``; what is set so is that
+    graph's own, and reaches the runs that a call makes on its thread.
+
     Semeniuta and Falkman 2019, "Nodes and pipelines".
     """
 

@@ -329,10 +329,10 @@ def _with_nested_slots(steps: Iterable[Step], tokens: list[str], states: list[St
 
     taken = set(tokens)
     for step in steps:
-        runner = getattr(step.function, RUNNER, None) if type(step.function) is not FunctionType else None
-        if runner is None:
+        if not hasattr(type(step.function), RUNNER):
             yield step
             continue
+        runner: CompGraphRunner = getattr(step.function, RUNNER)
         initial = getattr(step.function, INITIAL_STATE)
         own = [
             StateSlots(name := f"{step.name}.{key}", new_slot(name), new_slot(f"{name}, new"), value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -346,3 +347,19 @@ def test_a_pipeline_around_a_pipeline_takes_the_values_too(geometry, counted):
     pipe["geometry__threshold"] = 5
     pipe.set(geometry__offset=1, gain=2)
     assert pipe(1) == -16
+
+
+@pytest.mark.parametrize("kind", ["source", "sink", "full"])
+def test_a_reactive_pipeline_takes_them_too(geometry, counted, kind):
+    cg, hparams = geometry.source_cg, {"threshold": 2, "offset": 0}
+    q_in, q_out = queue.Queue(), queue.Queue()
+    pipe = {
+        "source": lambda: ep.SourcePipeline("p", cg, q_out, lambda view: view["area"], hparams),
+        "sink": lambda: ep.SinkPipeline("p", cg, q_in, lambda event: {"x": event}, hparams),
+        "full": lambda: ep.FullPipeline("p", cg, q_in, q_out, lambda event: {"x": event}, None, hparams),
+    }[kind]()
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": pipe}, {"f": ("a", "b")}))
+    assert runner.run(a=1)["b"] == 4
+    counted.taken()
+    assert runner.rerun(f__threshold=5)["b"] == 10
+    assert counted.taken() == ["ransac", "measure"]
