@@ -75,7 +75,7 @@ def test_hints_are_given_by_the_name_in_the_graph(runner: ep.CompGraphRunner) ->
 
 def test_they_stand_in_the_folder_of_the_pipeline(panel: Panel) -> None:
     column = panel._column
-    assert [folder["function"] for folder in column.folders] == ["gain", "cut"]
+    assert [folder["functions"] for folder in column.folders] == [["gain"], ["cut"]]
     assert [row["names"] for row in column.rows] == [["factor"], ["cut__level"], ["cut__clip_low", "cut__clip_high"]]
     control = panel._controls.control("cut__level")
     assert control.widget.description == "level", "the folder has the pipeline's name"
