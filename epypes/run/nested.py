@@ -52,6 +52,7 @@ class Loan:
 
 def call_nested(step: Step, nested: NestedSlots, values: list[Any], *args: Any) -> Any:
     """Call a pipeline and store its Run, a failed one too; return its value, then the states that it leaves."""
+    __tracebackhide__ = True
     runner, keys, before = nested.runner, nested.keys, values[nested.run]
     count, is_known = len(args) - len(keys), type(before) is NestedRun
     new = [place for place, slot in enumerate(step.inputs) if slot in before.new] if is_known else []
