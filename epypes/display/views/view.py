@@ -21,7 +21,7 @@ from epypes.display.text import (
     short_name,
 )
 from epypes.display.views.graphview import Direction, FunctionView, GraphView, GroupView, StageView, TokenState
-from epypes.display.views.groups import collapsed, groups_of, outside_tokens, twice_seen
+from epypes.display.views.groups import MOST_SHOWN, collapsed, folded, groups_of, outside_tokens, twice_seen
 from epypes.display.views.pipelines import Inside, insides_of
 from epypes.display.views.pipelines import opened as with_inside
 from epypes.display.views.structure import structure_of
@@ -70,6 +70,9 @@ def view(
     _require_options(direction, thumbnails, collapse, depth)
     cg = _graph_of(shown)
     groups = groups_of(cg.functions, cg.groups)
+    grouped = {name for inside in groups.values() for name in inside}
+    if len(cg.functions) - len(grouped) + len(groups) > MOST_SHOWN:
+        groups |= folded(cg, grouped)
     opened, pipelines = names_of("open", open), {inside.name: inside for inside in _insides(shown)}
     for name in opened:
         if name not in groups and name not in pipelines:
