@@ -200,7 +200,7 @@ def test_a_view_is_the_same_after_json_and_stays_small(how):
     graph = view(runner_of().run(image=IMAGE), **how)
     assert from_json(json.loads(json.dumps(to_json(graph)))) == graph
     html = mimebundle(ep.show(runner_of().run(image=IMAGE), **how))["text/html"]
-    assert len(html.encode()) <= 20_000 + 600 * 13 + 80_000
+    assert len(html.encode()) <= 30_000 + 600 * 13 + 80_000 + 150_000
 
 
 def test_thumbnails_of_both_share_the_room():
@@ -211,7 +211,7 @@ def test_thumbnails_of_both_share_the_room():
     run = runner.run(a=noise)
     for how in ({}, {"depth": 1}):
         html = mimebundle(ep.show(run, **how))["text/html"]
-        assert len(html.encode()) <= 20_000 + 600 * (22 + 24) + 80_000
+        assert len(html.encode()) <= 30_000 + 600 * (22 + 24) + 80_000 + 150_000
 
 
 def test_the_open_picture_is_labelled_to_the_right_too():

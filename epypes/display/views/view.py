@@ -81,15 +81,16 @@ def view(
     closed = {name: inside for name, inside in groups.items() if collapse and name not in opened}
     characters = THUMBNAIL_CHARACTERS - CHARACTERS_OF_A_VERTEX * twice_seen(cg, closed)
     room = Room(thumbnails, max(characters, _LEAST_CHARACTERS))
-    hidden = {function for inside in closed.values() for function in inside}
-    to_open = [name for name in pipelines if _is_open(name, pipelines[name], opened, depth) and name not in hidden]
+    to_open = [name for name in pipelines if _is_open(name, pipelines[name], opened, depth)]
+    to_open = [name for name in to_open if not any(name in inside for inside in closed.values())]
     part = Room(thumbnails, room.characters // (len(to_open) + 1))
     graph = _whole(shown, part, closed)
     for name in to_open:
         graph = with_inside(graph, pipelines[name], _inside_view(shown, pipelines[name], part))
-    drawn = {frame.name for frame in graph.frames}
+    drawn = [frame.name for frame in graph.frames]
     graph = collapsed(graph if graph.direction == direction else replace(graph, direction=direction), closed)
-    graph = _with_closed(shown, graph, [inside for name, inside in pipelines.items() if name not in drawn], room)
+    if pipelines:
+        graph = _with_closed(shown, graph, [inside for name, inside in pipelines.items() if name not in drawn], room)
     return graph if graph.draws_edges else _captioned(graph, f"{len(graph.edges):,} edges, too many to be drawn")
 
 
