@@ -298,7 +298,7 @@ class _Processes(_Backend):
 
     def __init__(self, runner: CompGraphRunner, executor: Executor) -> None:
         super().__init__(runner, executor)
-        self._hyperparameters = packed_values(self.runner.hyperparameters, "Hyperparameter")
+        self._hyperparameters = packed_values(self.runner.current.own, "Hyperparameter")
         self._options = tuple((name, getattr(runner, name)) for name in ("workers", "guard", "check_mutation"))
         self._package: PackagedGraph | None = None
 

@@ -274,6 +274,8 @@ def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | str | None:
                 folder = tempfile.TemporaryDirectory(prefix="epypes-package-")
                 bundle = _unpacked(packaged.package.files, Path(folder.name))
                 values = unpacked_values(packaged.hyperparameters, bundle.enums)
+                # Those of pipelines inside are set for each job: not all have one.
+                values = {token: value for token, value in values.items() if token in bundle.cg.tokens}
                 loaded = bundle.enums, CompGraphRunner(bundle.cg, values, **dict(packaged.options)), folder
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
                 return _load_error(packaged.package.files, error)

@@ -43,7 +43,7 @@ def _clone(function: Any) -> Any:
     inner = without_nodes(function)
     if not is_plain_pipeline(inner):
         return inner
-    hyperparameters = inner.runner.hyperparameters
+    hyperparameters = inner.runner.current.own
     cg = _frozen(clone_graph(inner.source_cg), hyperparameters)
     return Pipeline(inner.name, cg, hyperparameters, workers=inner.runner.workers, guard=inner.runner.guard)
 
@@ -58,7 +58,7 @@ def clone_runner(runner: CompGraphRunner, hyperparameters: Mapping[str, Any] | N
     hyperparameters
         Its values in place of the runner's own, such as copies of them.
     """
-    values = runner.hyperparameters if hyperparameters is None else hyperparameters
+    values = runner.current.own if hyperparameters is None else hyperparameters
     return CompGraphRunner(
         _frozen(clone_graph(runner.cg), values), values,
         workers=runner.workers, guard=runner.guard, check_mutation=runner.check_mutation,
@@ -85,7 +85,7 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
     held = dict(vars(made))
     if isinstance(made, Pipeline):
         runner = made.runner
-        held |= {"cg": made.source_cg, "hparams": dict(runner.hyperparameters) or None}
+        held |= {"cg": made.source_cg, "hparams": dict(runner.current.own) or None}
         held |= {"workers": runner.workers, "guard": runner.guard}
     found: dict[str, Any] = {}
     for parameter in parameters_of(type(made)):

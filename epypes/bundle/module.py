@@ -132,7 +132,7 @@ def _pairs(
         yield f"Class {name!r}", kind, module.enums[name]
     if pipeline is not None:
         given = [getattr(pipeline, name, None) for name in _GIVEN[1:5]]
-        made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
+        made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.current.own))
         if isinstance(pipeline, FullPipeline):
             yield f"Pipeline {pipeline.name!r}", pipeline, made
         else:

@@ -169,7 +169,7 @@ def _write(
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
-    hyperparameters, stored = store_hyperparameters(runner.hyperparameters, MOST_NUMBERS)
+    hyperparameters, stored = store_hyperparameters(runner.current.own, MOST_NUMBERS)
     free = runner.free_source_tokens
     colours = _colours(cg, dict.fromkeys((*free, *wanted)), runner.last)
     pipeline = given if isinstance(given, Pipeline) and type(given) not in PIPELINES else None

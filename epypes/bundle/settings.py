@@ -22,7 +22,7 @@ from epypes.bundle.arrays import StoredArray
 from epypes.bundle.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
-from epypes.graph import ASSUMED, ColourOrder, CompGraph
+from epypes.graph import ASSUMED, ColourOrder, CompGraph, inside_of
 from epypes.hints import Param
 from epypes.images import ORDERS, Order
 from epypes.nothing import Nothing
@@ -173,7 +173,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     ports = {"inputs": list(settings.inputs), "outputs": list(settings.outputs)}
     ports |= {"own": list(settings.own)} if settings.own else {}
     hyperparameters = {
-        token: _table(_entry_of(cg, token, value), f"Taken by {', '.join(cg.digraph.consumers.get(token, ()))}.")
+        token: _table(_entry_of(cg, token, value), f"Taken by {', '.join(_takers(cg, token))}.")
         for token, value in settings.hyperparameters.items()
     }
     sections: dict[str, Any] = {
@@ -196,6 +196,13 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
         elif section:
             document.add(name, section)
     path.write_text(toml.dumps(document), encoding="utf-8")
+
+
+def _takers(cg: CompGraph, token: str) -> tuple[str, ...]:
+    """Return the functions that take a hyperparameter; of a pipeline, after its name."""
+    inner, inside = inside_of(cg, token)
+    around = token.removesuffix(inside) if inner is not cg else ""
+    return tuple(f"{around}{name}" for name in inner.digraph.consumers.get(inside, ()))
 
 
 def _toml() -> Any:

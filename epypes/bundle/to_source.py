@@ -165,14 +165,14 @@ class _Module:
     texts
         The functions: one for each pipeline in the graph, then its own.
     pipelines
-        The functions of pipelines, by the id of the pipeline.
+        The functions of pipelines, by the id of the pipeline and those of the values that the graph around gives it.
     compared
         What is compared with the notebook: how reasons call it, the value, its expression.
     """
 
     gathered: Slice
     texts: list[str] = field(default_factory=list)
-    pipelines: dict[int, _Function] = field(default_factory=dict)
+    pipelines: dict[tuple[int, ...], _Function] = field(default_factory=dict)
     compared: list[tuple[str, Any, str]] = field(default_factory=list)
 
     def expression(self, what: str, value: Any, reason: str, wanted: str = "") -> str:
@@ -329,7 +329,7 @@ class _Function:
     def __init__(
         self, module: _Module, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: Any, where: str = ""
     ) -> None:
-        self.module, self.name, self.cg, self.where = module, name, cg, where
+        self.module, self.name, self.cg, self.values, self.where = module, name, cg, values, where
         self.returns: Collection[str] = cg.sink_tokens if wanted is None else wanted
         found, needed = (set(cg.tokens), set(cg.functions)) if wanted is None else needed_for(cg, wanted)
         delays = [previous for previous in cg.delays if previous in found]
@@ -401,11 +401,17 @@ class _Function:
         module, function = self.module, without_nodes(self.cg.functions[name])
         if not is_plain_pipeline(function):
             return module.expression(f"Function {name!r}{self.where}", function, _NO_EXPRESSION, name)
-        if id(function) not in module.pipelines:
+        key, values = self._pipeline(name, function)
+        if key not in module.pipelines:
             inner, where = module.gathered.free_name(function.name), f" of pipeline {function.name!r}"
-            made = _Function(module, inner, function.cg, function.runner.hyperparameters, None, where)
-            module.pipelines[id(function)] = made
-        return module.pipelines[id(function)].name
+            module.pipelines[key] = _Function(module, inner, function.cg, values, None, where)
+        return module.pipelines[key].name
+
+    def _pipeline(self, name: str, function: Pipeline) -> tuple[tuple[int, ...], Mapping[str, Any]]:
+        """Return what tells the function of a pipeline from others, and the hyperparameters that it has here."""
+        own = function.runner.hyperparameters
+        values = {token: self.values.get(f"{name}__{token}", value) for token, value in own.items()}
+        return (id(function), *(id(value) for token, value in values.items() if value is not own[token])), values
 
     def _copied(self, name: str) -> Collection[int]:
         """Return the places of the inputs into which a function writes, so that it is given copies."""
@@ -432,9 +438,10 @@ class _Function:
         """Return the functions that may return Nothing, and the tokens that may be; these are at the beginning."""
         refer: dict[int, bool] = {}
         for key, function in distinct(self.cg.functions).items():  # a large graph has few under many names
-            inner = self.module.pipelines.get(id(without_nodes(function)))
-            is_of_inner = inner is not None and not inner.may_be_nothing.isdisjoint(inner.returns)
-            refer[key] = is_of_inner if inner is not None else _refers_to_nothing(function)
+            own = id(without_nodes(function))
+            inner = [made for (pipeline, *_), made in self.module.pipelines.items() if pipeline == own]
+            is_of_inner = any(not made.may_be_nothing.isdisjoint(made.returns) for made in inner)
+            refer[key] = is_of_inner if inner else _refers_to_nothing(function)
         finders, found = {name for name in self.places if refer[id(self.cg.functions[name])]}, {*nothings}
         for name in self.places:
             if name in finders or self._asked(name, found):

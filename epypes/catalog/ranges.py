@@ -13,7 +13,7 @@ from typing import Any
 
 from epypes.catalog.calls import parameter_names, uses
 from epypes.catalog.lookup import CatalogEntry, entry_of, fits, usual
-from epypes.graph import CompGraph, annotated_params, as_switch
+from epypes.graph import CompGraph, annotated_params, as_switch, inside_of
 from epypes.hints import Param, Roi
 
 
@@ -25,6 +25,7 @@ def plain(value: Any) -> Any:
 
 def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:
     """Return the values that a hyperparameter may take, of which its present one is one; None if nothing says so."""
+    cg, token = inside_of(cg, token)
     number = plain(value)
     for hint in _hints(cg, token):
         # Values are any objects; one that can't be compared has no range.

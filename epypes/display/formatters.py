@@ -146,7 +146,8 @@ class Figure:
         return path
 
     def __repr__(self) -> str:
-        groups = f", {counted(len(self.view.groups), 'closed group')}" * bool(self.view.groups)
+        closed = sum(function.kind == "group" for function in self.view.functions)
+        groups = f", {counted(closed, 'closed group')}" * bool(closed)
         return f"<Figure: {counted(function_count(self.view), 'function')}{groups}; {self.view.direction}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> Forms:
@@ -160,6 +161,7 @@ def show(
     thumbnails: int = MOST_THUMBNAILS,
     open: str | Iterable[str] = (),  # noqa: A002 - the word for what is done to a box
     collapse: bool = True,
+    depth: int = 0,
 ) -> Figure:
     """Look at a graph, a runner, a run, a plan or a pipeline, and draw it in this way.
 
@@ -172,11 +174,16 @@ def show(
     thumbnails
         How many there are at most.
     open
-        The groups whose functions are drawn one by one.
+        The groups whose functions are drawn one by one, and the pipelines whose inside is drawn in a frame: of one in
+        another, ``"geometry__pose"``.
     collapse
         Whether groups are drawn as one box each, but for those that are open. Beside those of ``ep.group``, functions
         whose names have one prefix (``left.blur``, ``left.canny`` ...) are a group in a graph of more than 24; if it
         has still more than 24 boxes, so are stretches of the way that the data takes (``"blur … canny"``).
+
+    depth
+        How many levels of pipelines are drawn open; what is inside the others opens below the picture when they are
+        clicked.
 
     Returns
     -------
@@ -196,5 +203,5 @@ def show(
     >>> show(CompGraph({"f": abs}, {"f": ("x", "y")}), direction="right")
     <Figure: 1 function; right>
     """
-    graph = view(shown, direction=direction, thumbnails=thumbnails, open=open, collapse=collapse)
+    graph = view(shown, direction=direction, thumbnails=thumbnails, open=open, collapse=collapse, depth=depth)
     return Figure(graph, _table_below(shown), run_of(shown))

@@ -79,6 +79,7 @@ def lay_out(
     is_dense: bool = False,
     direction: Direction = "down",
     back: tuple[Edge, ...] = (),
+    frames: tuple[tuple[int, ...], ...] = (),
 ) -> Layout:
     """Place vertices and edges.
 
@@ -93,6 +94,8 @@ def lay_out(
         Where edges lead.
     back
         Edges that lead back, which set no vertex below another; their splines come last. None in rows.
+    frames
+        Vertices that stand together, with no other one among them: those of a pipeline, before those inside it.
 
     Raises
     ------
@@ -100,15 +103,21 @@ def lay_out(
         No engine answered.
     """
     if direction == "down":
-        layout = _downwards(boxes, edges, back, is_dense)
-        narrow = _downwards(boxes, edges, back, is_dense, is_narrow=True) if layout.width > _PAGE_PX else layout
+        layout = _downwards(boxes, edges, back, is_dense, frames)
+        narrow = _downwards(boxes, edges, back, is_dense, frames, is_narrow=True) if layout.width > _PAGE_PX else layout
         return narrow if narrow.width < layout.width else layout
-    layout = _downwards(tuple(Box(box.shape, box.height, box.width) for box in boxes), edges, back, is_dense)
+    layout = _downwards(tuple(Box(box.shape, box.height, box.width) for box in boxes), edges, back, is_dense, frames)
     return layout.moved(lambda point: point[::-1], layout.height, layout.width)
 
 
 def _downwards(
-    boxes: tuple[Box, ...], edges: tuple[Edge, ...], back: tuple[Edge, ...], is_dense: bool, *, is_narrow: bool = False
+    boxes: tuple[Box, ...],
+    edges: tuple[Edge, ...],
+    back: tuple[Edge, ...],
+    is_dense: bool,
+    frames: tuple[tuple[int, ...], ...],
+    *,
+    is_narrow: bool = False,
 ) -> Layout:
     graph = fold(boxes, edges, {end for edge in back for end in edge}, is_narrow=is_narrow)
     if is_dense or len(graph.boxes) > _MOST_VERTICES:
@@ -117,7 +126,9 @@ def _downwards(
     unrouted = _long_edges(len(graph.boxes), graph.edges, small_back)
     routed = [edge for edge in graph.edges if edge not in unrouted]
     routed_back = [edge for edge in small_back if edge not in unrouted]
-    layout = _in_order(routed_layout(graph.boxes, routed, graph.blocks, routed_back), graph.edges)
+    small_frames = [{graph.place[vertex] for vertex in frame} for frame in frames]
+    layout = routed_layout(graph.boxes, routed, graph.blocks, routed_back, small_frames)
+    layout = _in_order(layout, graph.edges)
     routed += routed_back
     layout = _alike_in_order(layout, graph.boxes, [*graph.edges, *small_back], routed)
     arcs = {edge for edge in (*edges, *back) if graph.folded(edge) in unrouted}
@@ -129,6 +140,8 @@ def _downwards(
 
 _POINTS_PER_INCH: Final = 72.0
 _DOT_TIMEOUT_S: Final = 30.0
+# From the vertices in a frame to its border.
+FRAME_PX: Final = 26.0
 # How much straighter than a hyperparameter's edges those of the data are drawn. If all were alike, each hyperparameter
 # beside a chain would push the rest of it aside, and a picture of 19 functions would be half as wide again.
 _FLOW_WEIGHT: Final = "8"
@@ -137,7 +150,11 @@ _engine_lock = threading.Lock()
 
 
 def routed_layout(
-    boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int] = (), back: Sequence[Edge] = ()
+    boxes: Sequence[Box],
+    edges: Sequence[Edge],
+    blocks: Collection[int] = (),
+    back: Sequence[Edge] = (),
+    frames: Sequence[Collection[int]] = (),
 ) -> Layout:
     """Return the layout of Graphviz, with a spline for every edge, those that lead back last.
 
@@ -155,7 +172,7 @@ def routed_layout(
     LayoutUnavailable
         No engine answered.
     """
-    source, tried = _dot_source(boxes, edges, blocks, back), []
+    source, tried = _dot_source(boxes, edges, blocks, back, frames), []
     for name, engine in (("pygraphviz", _pygraphviz), ("dot on the PATH", _dot_on_path)):
         try:
             return _read(json.loads(engine(source)), len(boxes), (*edges, *back))
@@ -164,7 +181,13 @@ def routed_layout(
     raise LayoutUnavailable(tried)
 
 
-def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int], back: Sequence[Edge]) -> str:
+def _dot_source(
+    boxes: Sequence[Box],
+    edges: Sequence[Edge],
+    blocks: Collection[int],
+    back: Sequence[Edge],
+    frames: Sequence[Collection[int]],
+) -> str:
     try:
         import graphviz
     except ImportError as error:
@@ -190,7 +213,22 @@ def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[
         dot.edge(*ends, arrowhead="none" if head in blocks else None, weight=weight)
     for tail, head in back:
         dot.edge(f"v{tail}", f"v{head}", constraint="false")
+    for place, frame in enumerate(frames):
+        if not any(set(frame) < set(other) for other in frames):
+            dot.subgraph(_cluster(graphviz, frames, place))
     return str(dot.source)
+
+
+def _cluster(graphviz: Any, frames: Sequence[Collection[int]], place: int) -> Any:
+    """Return what keeps the vertices of a frame together, with the frames directly in it."""
+    cluster = graphviz.Digraph(f"cluster{place}", graph_attr={"margin": f"{FRAME_PX:.0f}"})
+    inner = [other for other in range(len(frames)) if set(frames[other]) < set(frames[place])]
+    for other in inner:
+        if not any(set(frames[other]) < set(frames[each]) for each in inner):
+            cluster.subgraph(_cluster(graphviz, frames, other))
+    for vertex in sorted(frames[place]):
+        cluster.node(f"v{vertex}")
+    return cluster
 
 
 def _pygraphviz(source: str) -> str:
@@ -221,6 +259,8 @@ def _read(drawn: dict[str, Any], vertices: int, edges: Sequence[Edge]) -> Layout
     centres = [(0.0, 0.0)] * vertices
     number: dict[int, int] = {}
     for node in drawn.get("objects", ()):
+        if "pos" not in node:
+            continue  # a frame
         index = int(node["name"][1:])
         x, y = map(float, node["pos"].split(","))
         centres[index] = (x, height - y)

@@ -18,7 +18,7 @@ from epypes.graph.algebra import (
 )
 from epypes.graph.colours import ASSUMED, ColourOrder, colour_order
 from epypes.graph.compgraph import CompGraph
-from epypes.graph.identity import inner_graph, is_redefined_inside, redefined, unwrapped
+from epypes.graph.identity import inner_graph, inside_of, is_redefined_inside, redefined, unwrapped
 from epypes.graph.placeholder import Placeholder, is_placeholder
 from epypes.graph.signature import outputs
 from epypes.graph.switch import Switch, as_switch, switch
@@ -27,8 +27,8 @@ from epypes.graph.validation import Delay
 
 __all__ = [
     "ASSUMED", "ColourOrder", "CompGraph", "Delay", "Placeholder", "Switch", "annotated_params", "as_switch",
-    "colour_order", "delay", "extend", "group", "inner_graph", "is_placeholder", "is_redefined_inside", "names_of",
-    "needed_for", "outputs", "redefined", "rename", "subgraph", "suffix", "switch", "union", "unwrapped",
+    "colour_order", "delay", "extend", "group", "inner_graph", "inside_of", "is_placeholder", "is_redefined_inside",
+    "names_of", "needed_for", "outputs", "redefined", "rename", "subgraph", "suffix", "switch", "union", "unwrapped",
     "with_defaults", "with_functions",
 ]  # fmt: skip
 

@@ -47,6 +47,20 @@ def inner_graph(function: Any) -> CompGraph | None:
         return None
 
 
+def inside_of(cg: CompGraph, token: str) -> tuple[CompGraph, str]:
+    """Return the graph of the pipeline that ``"geometry__threshold"`` is a hyperparameter of, and its token there.
+
+    Of any other name the graph itself, and the name.
+    """
+    for name, function in cg.functions.items() if "__" in token and token not in cg.tokens else ():
+        inner = inner_graph(function) if token.startswith(f"{name}__") else None
+        if inner is not None:
+            found = inside_of(inner, token.removeprefix(f"{name}__"))
+            if found[1] in found[0].source_tokens:
+                return found
+    return cg, token
+
+
 def redefined(cg: CompGraph) -> tuple[str, ...]:
     """Return the functions whose module now binds their name to another function, in run order.
 

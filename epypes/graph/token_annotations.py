@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.identity import innermost
+from epypes.graph.identity import innermost, inside_of
 from epypes.graph.signature import distinct, positional_names
 from epypes.hints import Param, Roi, param_of
 from epypes.images import Contracts, Image, mark_of
@@ -156,6 +156,7 @@ def bare(hint: Any) -> Any:
 
 def annotated_params(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
     """Give the ranges in the annotations of the functions that take a token, in run order."""
+    cg, token = inside_of(cg, token)
     for name in cg.digraph.consumers.get(token, ()):
         function, tokens = cg.functions[name], cg.func_inputs(name)
         hints = _hints_of_tokens(function, len(tokens), None) if _is_annotated(function) else None

@@ -82,6 +82,9 @@ class Pipeline(Node, TokenMapping):
 
     Notes
     -----
+    In another graph its hyperparameters are called as in scikit-learn, ``"function__token"``; what is set so is that
+    graph's own, and reaches the runs that a call makes on its thread.
+
     Semeniuta and Falkman 2019, "Nodes and pipelines".
     """
 
@@ -120,6 +123,11 @@ class Pipeline(Node, TokenMapping):
         ``around`` are the programs of the pipelines that ask.
         """
         return self.runner.revision, *self.runner._program.revisions(around)
+
+    @property
+    def __epypes_runner__(self) -> CompGraphRunner:
+        """The runner, for the graph that the pipeline is a function of."""
+        return self.runner
 
     @property
     def __epypes_initial_state__(self) -> Mapping[str, Any]:

@@ -12,11 +12,12 @@ from epypes.errors import ContractBroken, InputMutated, OutputArityError
 from epypes.images import Image
 from epypes.nothing import Nothing, NothingGiven
 from epypes.run.guard import ARRAYLESS, FRESH, is_array, keep, lend, lend_to_reader, writable, writable_copy
+from epypes.run.nested import call_nested
 from epypes.run.program import Program, Step
 from epypes.run.snapshot import Snapshot
 
 
-def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict[int, int]) -> Sequence[Any]:
+def call(program: Program, step: Step, values: list[Any], durations_ns: dict[int, int]) -> Sequence[Any]:
     """Call a step's function on the values of its inputs; return one value per output token, guarded.
 
     Raises
@@ -30,7 +31,7 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
     """
     __tracebackhide__ = True
     # Unpacked at once: to look up one field of a named tuple takes as long.
-    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node, _ = step
+    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node, _, nested = step
     if node is not None:
         function = node.func
     start_ns = 0
@@ -42,6 +43,8 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
                 args.append(value if type(value) in ARRAYLESS else lend(value))
         else:
             args = _args(program, step, values)
+            if nested is not None:
+                function = partial(call_nested, step, nested, values)
             if program.check_mutation and switch is None:
                 function = partial(_call_checked, program, step, function, values)
         start_ns = perf_counter_ns()

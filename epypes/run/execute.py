@@ -34,7 +34,7 @@ from epypes.run.guard import (
     lend,
 )
 from epypes.run.program import Program, Step
-from epypes.run.staleness import TokenManager, is_unchanged
+from epypes.run.staleness import TokenManager, is_unchanged, with_new_input
 from epypes.run.timing import longest_path_ns
 from epypes.tracebacks import HIDE
 
@@ -186,6 +186,7 @@ _NAMES: Final = {
     "go_on": go_on_one_by_one,
     "Nothing": Nothing,
     "NothingGiven": NothingGiven,
+    "with_new_input": with_new_input,
 }
 _FREQUENT: Final = ("clock", "kind", "count", "array", "HARMLESS")
 
@@ -215,7 +216,7 @@ class _Source:
         self._array, self._kinds = array_type(), kinds
         self._certain = bytes(tokens.begin().dirty)
         self._carried = tokens.origin or b""
-        self._changed = {program.slots[token] for token in tokens.changed}
+        self._changed = {program.settable[token] for token in tokens.changed}
         wanted = tokens.wanted
         stale = program.downstream((place for place, dirty in enumerate(self._certain) if dirty), ())
         self._steps = [program.steps[place] for place in sorted(stale) if wanted is None or wanted[place]]
@@ -231,6 +232,7 @@ class _Source:
 
     def compile(self) -> Way:
         """Return the function that runs the steps."""
+        inside = self._program.inside
         lines = [
             f"def make(program, steps, {', '.join(_NAMES)}, array, dirty, left):",
             *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
@@ -239,6 +241,11 @@ class _Source:
             "        start = 0; v = t.values; d = t.durations_ns",
             "        D = t.dirty = bytearray(dirty)" if self._has_flags else "        t.dirty = dirty",
             "        try:",
+            *(
+                f"            {line}"
+                for slot in (sorted(self._changed & inside.keys()) if inside else ())
+                for line in self._renew(slot)
+            ),
             *(f"            {line}" for line in self._lend_sources()),
             *(f"            {line}" for step in self._steps for line in self._step(step)),
             "            t.dirty = left" if self._is_known else "            pass",
@@ -274,7 +281,7 @@ class _Source:
     def _is_written_out(self, step: Step) -> bool:
         program = self._program
         return step.is_plain or not (
-            program.guard or step.contracts or program.check_mutation or step.switch is not None
+            step.nested or program.guard or step.contracts or program.check_mutation or step.switch is not None
         )
 
     def _step(self, step: Step) -> Iterator[str]:
@@ -287,6 +294,8 @@ class _Source:
                     f"if c{slot}:",
                     f"    v[{slot}] = m{place}",
                 ]
+                if slot in self._program.inside:
+                    lines += (f"    {line}" for line in self._renew(slot))
                 if self._has_flags:
                     lines.append(f"    {' = '.join(f'D[{reader}]' for reader in self._program.consumers[slot])} = 1")
             else:
@@ -300,6 +309,10 @@ class _Source:
             lines = [f"    {line}" for line in lines]
         yield from lines
         self._known.update(checked)
+
+    def _renew(self, slot: int) -> list[str]:
+        """Write out that nested pipelines have a new input."""
+        return [f"v[{run}] = with_new_input(v[{run}], {slot})" for run in self._program.inside[slot]]
 
     def _given(self, step: Step) -> str:
         """Write out the values that a step read and that are not new; none if it is not known what was new to it."""
@@ -472,6 +485,8 @@ class SideBySide:
         if self._failures:
             # Ctrl-C or an exit comes before what functions raise.
             failed_at = min(self._failures, key=lambda place: (isinstance(self._failures[place], Exception), place))
+            reached = [tokens.program.steps[place].nested for place in (*self._made, failed_at) if place <= failed_at]
+            runs = [(each.run, tokens.values[each.run]) for each in reached if each is not None]
             tokens.values[:], tokens.dirty[:] = self._before
             for place, made in sorted(self._made.items()):
                 step = tokens.program.steps[place]
@@ -482,6 +497,8 @@ class SideBySide:
             for place in self._failures:
                 if place != failed_at:
                     self._durations_ns.pop(place, None)  # one that was interrupted while it ran has none
+            for slot, run in runs:
+                tokens.values[slot] = run
             tokens.running = failed_at
             raise self._failures[failed_at]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from operator import is_
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -12,6 +13,8 @@ from epypes.run.guard import ARRAYLESS, COPIERS, keep, require_reusable
 from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, TokenManager, is_same_value, new_tokens
 
+# The revision of hyperparameters that a graph lends to a pipeline.
+_LENT: Final = -2
 # Of a longer value an error has dots.
 _BRIEF: Final = 40
 
@@ -38,6 +41,8 @@ class Hyperparameters:
     changed: Mapping[str, Any] = MappingProxyType({})
     follows = -1
     _start: tuple[list[Any], dict[str, int]] | None = None
+    # Those of nested pipelines as they were when they were last asked for.
+    _seen: tuple[Hyperparameters, ...] = ()
 
     def __init__(
         self,
@@ -68,7 +73,10 @@ class Hyperparameters:
         slots, cg = self.program.slots, self.program.cg
         base: list[Any] = [NOT_COMPUTED] * len(self.program.tokens)
         for token, entry in self.entries.items():
-            base[slots[token]] = entry[0]
+            if token in slots:
+                base[slots[token]] = entry[0]
+            else:  # what a nested pipeline gets, with its version
+                base[self.program.settable[token]] = entry
         free = {
             token: slots[token] for token in cg.source_tokens if token not in self.entries and token not in cg.delays
         }
@@ -76,15 +84,17 @@ class Hyperparameters:
         self._start = base, free
         return self._start
 
-    def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
+    def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True, are_first: bool = False) -> Hyperparameters:
         """Return these with tokens given values; all or nothing. An equal value changes nothing.
 
         Parameters
         ----------
         changes
-            Values by token.
+            Values by token; of nested pipelines by ``"function__token"``.
         also_new
             Whether source tokens that are not hyperparameters become some.
+        are_first
+            Whether these are the first values, also of hyperparameters of nested pipelines.
 
         Raises
         ------
@@ -108,15 +118,20 @@ class Hyperparameters:
                 continue
             if program.selectors:
                 self.require_branches({token: value})
+            is_nested = token in program.inner_names
+            if is_nested:
+                self._require_nested_branches(token, value)
             if not is_count:
-                plain = plain if (type(value) in ARRAYLESS) == (token in plain) else plain ^ {token}
+                if not is_nested:
+                    plain = plain if (type(value) in ARRAYLESS) == (token in plain) else plain ^ {token}
                 # A copy of what others could write to: a change in place would not be noticed.
-                value = keep(value, 0, program, program.slots[token], ()) if program.guard else value
-            new[token] = value
-            entries[token] = (value, value if entry is None else entry[1])
+                value = keep(value, 0, program, program.settable[token], ()) if program.guard else value
+            entries[token] = made_entry = (value, value if entry is None or are_first else entry[1])
+            new[token] = made_entry if is_nested else value
         if not new:
             return self
         made = _new_hyperparameters()
+        made._seen = self._seen
         made.program, made.entries, made.revision, made.plain = program, entries, revision + 1, plain
         made.changed, made.follows = new, follows
         return made
@@ -125,7 +140,52 @@ class Hyperparameters:
         """Return these without a token, which becomes a free source token."""
         self.require(token)
         entries = {name: entry for name, entry in self.entries.items() if name != token}
-        return Hyperparameters(self.program, entries, self.revision + 1, self.plain - {token})
+        made = Hyperparameters(self.program, entries, self.revision + 1, self.plain - {token})
+        if token in self.program.slots:
+            made._seen = self._seen
+        return made.current
+
+    @property
+    def current(self) -> Hyperparameters:
+        """These, with what has changed in nested pipelines since: of the two the value that was set last counts."""
+        program, seen = self.program, self._seen
+        now = tuple([nested.runner.current for nested in program.nested.values()])
+        if len(seen) == len(now) and all(map(is_, seen, now)):
+            return self
+        entries = self.entries.copy()
+        before = [known.entries for known in seen] or [dict[str, tuple[Any, Any]]()] * len(now)
+        for nested, old, hparams in zip(program.nested.values(), before, now, strict=True):
+            for token, name in nested.names.items():
+                entry = hparams.entries.get(token)
+                if entry is None:
+                    entries.pop(name, None)
+                elif entry is not old.get(token) and (seen or name not in entries):
+                    entries[name] = entry
+        made = Hyperparameters(program, entries, self.revision + bool(seen), self.plain)
+        made._seen = now
+        return made
+
+    def with_entries(self, entries: Mapping[str, tuple[Any, Any]]) -> Hyperparameters:
+        """Return those of a call that gets some values, with their versions, from the graph around its pipeline."""
+        if all(self.entries.get(token) is entry for token, entry in entries.items()):
+            return self
+        both, slots = {**self.entries, **entries}, self.program.slots
+        plain = frozenset(token for token, (value, _) in both.items() if type(value) in ARRAYLESS and token in slots)
+        # No revision follows this one.
+        made = Hyperparameters(self.program, both, _LENT, plain)
+        made._seen = self._seen
+        return made
+
+    @property
+    def own(self) -> Mapping[str, Any]:
+        """The values by token, without those that nested pipelines have themselves."""
+        known = [
+            (name, hparams.entries.get(token))
+            for nested, hparams in zip(self.program.nested.values(), self._seen, strict=False)
+            for token, name in nested.names.items()
+        ]
+        theirs = {name for name, entry in known if entry is self.entries.get(name)}
+        return {token: entry[0] for token, entry in self.entries.items() if token not in theirs}
 
     def tokens(self, payload: Mapping[str, Any], state: Sequence[Any]) -> TokenManager:
         """Return the tokens of a run from scratch on a payload and a state, before its first step.
@@ -159,12 +219,22 @@ class Hyperparameters:
             return {}
         if self.follows == earlier.revision:
             return self.changed
-        entries = self.entries.items()
-        return {token: entry[0] for token, entry in entries if earlier.entries.get(token) is not entry}
+        slots, old = self.program.slots, earlier.entries
+        new = [(token, entry) for token, entry in self.entries.items() if old.get(token) is not entry]
+        changes = {token: entry[0] if token in slots else entry for token, entry in new}
+        if self.program.nested:
+            lost = (token for token in old if token in self.program.inner_names and token not in self.entries)
+            changes |= dict.fromkeys(lost, NOT_COMPUTED)
+        return changes
 
     def require_source(self, token: str) -> None:
         """Raise unless the token exists and no function makes it."""
         cg = self.program.cg
+        if token in self.program.inner_names:
+            text = f"{token!r} is free in its pipeline, not a hyperparameter. Freeze it there: pipeline.runner.freeze."
+            raise HyperparameterError(token, text)
+        if self.program.nested and token not in cg.tokens:
+            raise UnknownName("token", token, self.program.settable)
         cg.require_token(token)
         maker = cg.digraph.producer.get(token)
         if maker is not None:
@@ -178,6 +248,15 @@ class Hyperparameters:
         for token, selector in values.items():
             for switch in self.program.selectors.get(token, ()):
                 switch.branch_index(selector)
+
+    def _require_nested_branches(self, name: str, value: Any) -> None:
+        for nested in self.program.nested.values():
+            for token in [token for token, known in nested.names.items() if known == name]:
+                inner = nested.runner.current
+                if token in inner.program.slots:
+                    inner.require_branches({token: value})
+                else:
+                    inner._require_nested_branches(token, value)
 
     def require(self, token: str) -> None:
         """Raise unless the token is a hyperparameter, with the way out for one that is not."""
@@ -199,7 +278,7 @@ class Hyperparameters:
         def change(name: str) -> str:
             return f"Change it with rerun({name}={text}), or with runner[{name!r}] = {text} before {run_call(free)}."
 
-        if not cg.has_token(token):
+        if not cg.has_token(token) and token not in self.entries:
             near = nearest(token, (*free, *self.entries))
             advice = f" Did you mean the hyperparameter {near!r}? {change(near)}" if near in self.entries else ""
             return UnknownName("token", token, free, advice=advice)

@@ -112,7 +112,8 @@ def _reason(manager: TokenManager, index: int, changed: Collection[str]) -> str:
     if step.outputs and all(manager.values[slot] is NOT_COMPUTED for slot in step.outputs):
         return "not computed yet"
     read = program.read_by(step, manager.values)
-    new = [repr(program.tokens[slot]) for slot in dict.fromkeys(read) if program.tokens[slot] in changed]
+    inside = step.nested.hparams.values() if step.nested is not None else ()
+    new = [repr(program.tokens[slot]) for slot in dict.fromkeys((*read, *inside)) if program.tokens[slot] in changed]
     if new:
         return f"{', '.join(new)} changed"
     remade = [repr(program.tokens[slot]) for slot in dict.fromkeys(read) if program.makers[slot] in manager.stale]

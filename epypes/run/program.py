@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from weakref import ref
 
 from epypes.errors import Finding, GraphError
@@ -18,6 +18,9 @@ from epypes.graph import CompGraph, Switch, as_switch
 from epypes.graph.signature import distinct
 from epypes.images import Contracts
 from epypes.run.guard import called_for, in_out_places, is_unguarded, keep
+
+if TYPE_CHECKING:
+    from epypes.run.runner import CompGraphRunner
 
 # What a function has that keeps hyperparameters of its own: a method that returns another value whenever they have
 # changed, given the programs that ask for it.
@@ -32,6 +35,8 @@ MAX_UNCOUNTED: Final = 100
 # takes a state and inputs, and returns the value and the state after.
 INITIAL_STATE: Final = "__epypes_initial_state__"
 CALL_WITH_STATE: Final = "__epypes_call_with_state__"
+# What a nested pipeline has: its runner.
+RUNNER: Final = "__epypes_runner__"
 # More objects than any function refers to on purpose.
 _MOST_REACHED: Final = 1_000
 
@@ -59,6 +64,8 @@ class Step(NamedTuple):
         The function, if it is a node whose ``func`` may be called in its place.
     in_out
         The places of the inputs into which it writes its results, and of which it gets copies.
+    nested
+        The slots of what is inside, if it is a pipeline.
     """
 
     place: int
@@ -73,6 +80,34 @@ class Step(NamedTuple):
     is_plain: bool
     node: Any
     in_out: tuple[int, ...]
+    nested: NestedSlots | None = None
+
+
+class NestedSlots(NamedTuple):
+    """What a graph keeps of a pipeline that is one of its functions.
+
+    Attributes
+    ----------
+    runner
+        The pipeline's own.
+    names
+        By hyperparameter token of the pipeline, its name in the graph: ``"function__token"``, as in scikit-learn.
+    hparams
+        By token, the slot of its entry: a tuple of its value and its first one, which is its version.
+    run
+        The slot of its Run, from which the next call goes on.
+    keys
+        Of its states, whose slots are the last ones of the step's inputs and outputs.
+    single
+        Whether its own value is one token as it is.
+    """
+
+    runner: CompGraphRunner
+    names: Mapping[str, str]
+    hparams: Mapping[str, int]
+    run: int
+    keys: tuple[str, ...]
+    single: bool
 
 
 class StateSlots(NamedTuple):
@@ -106,9 +141,17 @@ class Program:
     check_mutation
         Whether each call is checked for changes to its inputs.
     tokens
-        The tokens by slot; after those of the graph, the states of nested pipelines.
+        The tokens by slot; after those of the graph, what belongs to nested pipelines.
     slots
         The slots by token of the graph.
+    settable
+        The slots by token of the graph and by hyperparameter of nested pipelines.
+    inner_names
+        The hyperparameters of nested pipelines.
+    nested
+        By function, the slots of nested pipelines.
+    inside
+        By slot that nested pipelines take, the slots of their Runs.
     states
         What is kept between runs.
     steps
@@ -141,8 +184,19 @@ class Program:
         self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
         found_steps = _steps(cg, slots, guard and not check_mutation)
         nested: list[StateSlots] = []
-        self.steps = steps = tuple(_with_state_slots(found_steps, len(slots), nested))
-        self.tokens = (*cg.tokens, *(name for state in nested for name in (state.key, f"{state.key}, new")))
+        tokens = [*cg.tokens]
+        self.steps = steps = tuple(_with_nested_slots(found_steps, tokens, nested))
+        self.tokens = tuple(tokens)
+        self.nested = {step.name: step.nested for step in steps if step.nested is not None}
+        self.settable, self.inner_names, self.inside = slots, frozenset[str](), dict[int, list[int]]()
+        if self.nested:
+            pairs = [(each.names, each.hparams) for each in self.nested.values()]
+            self.settable = slots | {names[token]: at for names, hparams in pairs for token, at in hparams.items()}
+            self.inner_names = frozenset(self.settable) - frozenset(slots)
+            for step in steps:
+                if step.nested is not None:
+                    for slot in dict.fromkeys(step.inputs):
+                        self.inside.setdefault(slot, []).append(step.nested.run)
         delays = cg.delays.items()
         own = [StateSlots(token, slots[token], slots[delay.token], delay.initial) for token, delay in delays]
         self.states = tuple(
@@ -164,7 +218,7 @@ class Program:
         found: dict[int, tuple[object, ...]] = {
             key: objects
             for key, function in distinct(cg.functions).items()
-            if not _is_alone(function) and (objects := tuple(_with_revisions(function)))
+            if not _is_alone(function) and (objects := tuple(_revised_by(function)))
         }
         revised = [step for step in steps if id(cg.functions[step.name]) in found] if found else []
         self.revised = tuple(step.place for step in revised)
@@ -192,7 +246,7 @@ class Program:
         """By slot, the steps that read it, in run order."""
         consumers: list[list[int]] = [[] for _ in self.tokens]
         for step in self.steps:
-            for slot in dict.fromkeys(step.inputs):
+            for slot in dict.fromkeys((*step.inputs, *(step.nested.hparams.values() if step.nested else ()))):
                 consumers[slot].append(step.place)
         return consumers
 
@@ -217,6 +271,8 @@ class Program:
             return ()
         around = (*around, self)
         return tuple(tuple([getattr(found, REVISION)(around) for found in each]) for each in self._with_revisions)
+
+    __epypes_revision__ = revisions
 
     def read_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
         """Return the slots that a step reads with these values: of a switch, the selector and the chosen branch."""
@@ -264,36 +320,43 @@ class Program:
         return found
 
 
-def _with_state_slots(steps: Iterable[Step], count: int, states: list[StateSlots]) -> Iterator[Step]:
-    """Give steps; those that have state read and write it in slots of their own, after the ``count`` of the graph."""
+def _with_nested_slots(steps: Iterable[Step], tokens: list[str], states: list[StateSlots]) -> Iterator[Step]:
+    """Give steps; nested pipelines have slots of their own, behind those of the graph."""
+
+    def new_slot(name: str) -> int:
+        tokens.append(name)
+        return len(tokens) - 1
+
+    taken = set(tokens)
     for step in steps:
-        initial = getattr(step.function, INITIAL_STATE, None) if type(step.function) is not FunctionType else None
-        if not initial:
+        if not hasattr(type(step.function), RUNNER):
             yield step
             continue
-        start = count + 2 * len(states)
+        runner: CompGraphRunner = getattr(step.function, RUNNER)
+        initial = getattr(step.function, INITIAL_STATE)
         own = [
-            StateSlots(f"{step.name}.{key}", start + 2 * place, start + 2 * place + 1, value)
-            for place, (key, value) in enumerate(initial.items())
+            StateSlots(name := f"{step.name}.{key}", new_slot(name), new_slot(f"{name}, new"), value)
+            for key, value in initial.items()
         ]
         states.extend(own)
+        inner = runner._program
+        names = dict[str, str]()
+        for token in (*inner.cg.source_tokens, *(name for name in inner.settable if name in inner.inner_names)):
+            if token not in inner.cg.delays:
+                names[token] = f"{step.name}__{token}"
+                while names[token] in taken:  # by a token of the graph
+                    names[token] += "_"
+                taken.add(names[token])
+        hparams = {token: new_slot(name) for token, name in names.items()}
         yield step._replace(
-            function=partial(_call_with_state, step.function, tuple(initial), step.single),
             inputs=(*step.inputs, *(state.before for state in own)),
             outputs=(*step.outputs, *(state.after for state in own)),
-            single=False,
+            single=step.single and not own,
             is_plain=False,
+            nested=NestedSlots(
+                runner, names, hparams, new_slot(f"the run of {step.name}"), tuple(initial), step.single
+            ),
         )
-
-
-def _call_with_state(function: Any, keys: tuple[str, ...], single: bool, *args: Any) -> Any:
-    __tracebackhide__ = True
-    inputs, state = args[: -len(keys)], args[-len(keys) :]
-    value, after = getattr(function, CALL_WITH_STATE)(dict(zip(keys, state, strict=True)), inputs)
-    made = (
-        (value,) if single else () if value is None else tuple(value) if isinstance(value, tuple | list) else (value,)
-    )
-    return *made, *(after[key] for key in keys)
 
 
 def _is_alone(function: Any) -> bool:
@@ -302,6 +365,15 @@ def _is_alone(function: Any) -> bool:
         return False
     code = function.__code__
     return not code.co_names and len(code.co_consts) <= 1 and not function.__dict__
+
+
+def _revised_by(function: Any) -> Iterator[object]:
+    """Give what has a revision in a function; the hyperparameters of a nested pipeline are the graph's own."""
+    if hasattr(type(function), RUNNER):
+        inner = getattr(function, RUNNER)._program
+        yield from (inner,) * bool(inner.revised)
+    else:
+        yield from _with_revisions(function)
 
 
 def _with_revisions(function: object) -> Iterator[object]:
@@ -374,6 +446,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
             lends_only and not unguarded and switch is None and contract is None and not in_out,
             function if has_node else None,
             in_out,
+            None,
         ))  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from epypes.run.guard import READ_AS_STORED, lend, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import wanted_steps
 from epypes.run.program import Program, StateSlots
-from epypes.run.staleness import NOT_COMPUTED, TokenManager
+from epypes.run.staleness import NOT_COMPUTED, NestedRun, TokenManager
 from epypes.run.timing import RunReport, Times
 from epypes.wording import counted
 
@@ -127,6 +127,21 @@ class Run(TokenMapping):
         return tuple(map(value_after, program.states))
 
     @property
+    def nested(self) -> Mapping[str, Run]:
+        """The runs of the pipelines in the graph, by function: ``run.nested["geometry"]["inliers"]``.
+
+        Of a function that failed, the run that failed. A pipeline that makes its own runs otherwise has none.
+        """
+        program, values = self.tokens.program, self.tokens.values
+        failed = self._failure.function if self._failure is not None else ""
+        found = {
+            name: values[nested.run]
+            for name, nested in program.nested.items()
+            if name == failed or any(map(self.tokens.is_computed, program.cg.func_outputs(name)))
+        }
+        return MappingProxyType({name: kept.run for name, kept in found.items() if type(kept) is NestedRun})
+
+    @property
     def cg(self) -> CompGraph:
         """The graph that was run."""
         return self.tokens.program.cg
@@ -211,7 +226,7 @@ class RunImporter:
             Of the function that failed, if one did.
         """
         program, first = self._program, first_hyperparameters or {}
-        known = [(token, value) for token, value in hyperparameters.items() if token in program.slots]
+        known = [(token, value) for token, value in hyperparameters.items() if token in program.settable]
         entries = {token: (value, first.get(token, value)) for token, value in known}
         hparams = Hyperparameters(program, entries, revision)
         stored = hparams.tokens({}, [NOT_COMPUTED] * len(program.states))

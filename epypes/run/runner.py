@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
+from threading import get_ident
 from time import perf_counter_ns
 from typing import Any, Final
 from weakref import ref
@@ -17,6 +18,7 @@ from epypes.run.execute import Executor, Way
 from epypes.run.failure import Failure, failure_of
 from epypes.run.guard import keep, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
+from epypes.run.nested import Loan
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
 from epypes.run.result import Run, TokenMapping, TrialOf, new_run, readable_state
@@ -104,7 +106,10 @@ class CompGraphRunner(OldNames, TokenMapping):
         self.last: Run | None = None
         self._kept = self._initial_state()
         given = {**cg.defaults, **hparams}
+        inside = {token: given.pop(token) for token in [*given] if token in self._program.inner_names}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
+        if self._program.nested:
+            self._hparams = self._hparams.current.frozen(inside, are_first=True)
 
     def _own_state(self) -> None:
         """Make what no two runners share, besides hyperparameters and the last run."""
@@ -117,6 +122,8 @@ class CompGraphRunner(OldNames, TokenMapping):
         self._keep_times = self.reports.kept.append
         # The run that failed last on each thread: `last` may be another thread's run by then.
         self._failed = threading.local()
+        # By thread, what a graph around this one's pipeline has lent to its call.
+        self.loans: dict[int, Loan] = {}
         # Held by a run with state: the next one begins with what it leaves.
         self._series = threading.RLock()
 
@@ -161,14 +168,40 @@ class CompGraphRunner(OldNames, TokenMapping):
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
-        hparams = self._hparams
+        if self.loans and (loan := self.loans.get(get_ident())) is not None:
+            return self._run_lent(loan, payload, targets, start_ns)
+        hparams = self.current if self._program.nested else self._hparams
         if not self._program.states:
             return self._run(hparams.tokens(payload, ()), hparams, targets, start_ns)
         with self._series:
             return self._run(hparams.tokens(payload, self._kept), hparams, targets, start_ns)
 
+    def _run_lent(self, loan: Loan, payload: Payload, targets: Sequence[str], start_ns: int) -> Run:
+        """Run with what a graph has lent to the pipeline of this one, on from its last call."""
+        __tracebackhide__ = True
+        hparams, before, is_passed_on = loan.hparams, loan.before, loan.is_passed_on(payload)
+        if before is not None and is_passed_on:
+            changes = dict(hparams.changes_since(before.hparams))
+            changes |= {token: value for place, (token, value) in enumerate(payload.items()) if place in loan.new}
+            tokens = before.tokens.branch(changes)
+            del before
+        else:
+            tokens = hparams.tokens(payload, self._kept)
+        loan.before = None
+        try:
+            run = self._run(tokens, hparams, targets, start_ns)
+        except BaseException as error:
+            loan.run = self.failed_run(error) if is_passed_on else None
+            raise
+        loan.run = run if is_passed_on else None
+        return run
+
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
+
+        Those of a pipeline in the graph are called as in scikit-learn: ``rerun(geometry__threshold=2)``. They are this
+        runner's own: the pipeline, and other graphs that it is in, keep theirs. What is set in the pipeline itself
+        afterwards counts here too.
 
         Raises
         ------
@@ -194,7 +227,8 @@ class CompGraphRunner(OldNames, TokenMapping):
         if targets:
             self._require_targets(targets)
         with self._lock:
-            first, last = self._hparams, self.last
+            first = self._hparams.current if self._program.nested else self._hparams
+            last = self.last
             hparams = first.frozen(changes, also_new=False)
             if not is_trial:
                 self._hparams = hparams
@@ -392,18 +426,26 @@ class CompGraphRunner(OldNames, TokenMapping):
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
-        """The values of the hyperparameters by token: a snapshot."""
-        return self._hparams.values
+        """The values of the hyperparameters by token, those of pipelines by ``"function__token"``: a snapshot."""
+        return self.current.values
+
+    @property
+    def current(self) -> Hyperparameters:
+        """The hyperparameters with their versions."""
+        if self._program.nested:
+            with self._lock:
+                self._hparams = self._hparams.current
+        return self._hparams
 
     @property
     def first_hyperparameters(self) -> Mapping[str, Any]:
         """The values that the hyperparameters had when they were made or frozen, by token: a snapshot."""
-        return self._hparams.first_values
+        return self.current.first_values
 
     @property
     def revision(self) -> int:
         """How often the hyperparameters have changed."""
-        return self._hparams.revision
+        return self.current.revision
 
     @property
     def free_source_tokens(self) -> tuple[str, ...]:
@@ -417,7 +459,7 @@ class CompGraphRunner(OldNames, TokenMapping):
     def unfreeze(self, token: str) -> None:
         """Make a hyperparameter a free source token again."""
         with self._lock:
-            self._hparams = self._hparams.unfrozen(token)
+            self._hparams = self._hparams.current.unfrozen(token)
         self._tell_watchers()
 
     def set(self, /, **values: Any) -> None:
@@ -435,7 +477,7 @@ class CompGraphRunner(OldNames, TokenMapping):
 
     def _change(self, values: Mapping[str, Any], also_new: bool) -> None:
         with self._lock:
-            self._hparams = self._hparams.frozen(values, also_new=also_new)
+            self._hparams = self._hparams.current.frozen(values, also_new=also_new)
         self._tell_watchers()
 
     # -- state --------------------------------------------------------------------------------------------------
@@ -519,7 +561,14 @@ class CompGraphRunner(OldNames, TokenMapping):
     def _state(self) -> tuple[Hyperparameters, Run | None]:
         """The hyperparameters and the last run, of one moment."""
         with self._lock:
+            if self._program.nested:
+                self._hparams = self._hparams.current
             return self._hparams, self.last
+
+    @property
+    def tokens_now(self) -> TokenManager:
+        """The tokens of the last run as they are to be read with the hyperparameters of now."""
+        return self._tokens_now(*self._state)
 
     def _tokens_now(self, hparams: Hyperparameters, last: Run | None) -> TokenManager:
         """Return a run's tokens as they are to be read with these hyperparameters.
@@ -545,6 +594,9 @@ class CompGraphRunner(OldNames, TokenMapping):
         if self._tokens_now(hparams, last).is_stale(token):
             raise StaleToken(token)
         return value
+
+    def __contains__(self, token: object) -> bool:
+        return isinstance(token, str) and self.cg.has_token(token) and super().__contains__(token)
 
     def __iter__(self) -> Iterator[str]:
         hparams, last = self._state

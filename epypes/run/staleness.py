@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from epypes.deprecation import OldNames
 from epypes.errors import NotComputed, StaleToken
@@ -18,6 +18,9 @@ from epypes.graph import CompGraph
 from epypes.nothing import Nothing, NothingType
 from epypes.run.guard import is_plain_array, is_same_guarded_array, lend_to_reader
 from epypes.run.program import Program, Step
+
+if TYPE_CHECKING:
+    from epypes.run.result import Run
 
 _SCALARS: Final = frozenset({int, float, complex, bool, type(None), NothingType})
 _TEXTS: Final = frozenset({str, bytes})
@@ -36,6 +39,18 @@ class _NotComputed:
 
 
 NOT_COMPUTED: Final = _NotComputed()
+
+
+class NestedRun(NamedTuple):
+    """The run of a nested pipeline, and the slots of its inputs that have got new values since."""
+
+    run: Run
+    new: tuple[int, ...] = ()
+
+
+def with_new_input(nested: Any, slot: int) -> Any:
+    """Note that an input of a nested pipeline has a new value, if the pipeline has run."""
+    return NestedRun(nested.run, (*nested.new, slot)) if type(nested) is NestedRun else nested
 
 
 class TokenManager(OldNames):
@@ -153,7 +168,7 @@ class TokenManager(OldNames):
             renewed = zip(program.revised, self.revisions, branch.revisions, strict=True)
             places = {place for place, before, now in renewed if before != now}
             branch.dirty = branch.origin = bytes(at in places or is_dirty for at, is_dirty in enumerate(self.dirty))
-        slots = program.slots
+        slots = program.settable
         if not are_new:
             old = {token: values[slots[token]] for token in changes}
             is_new = [not is_unchanged(old[token], value, (), program.guard) for token, value in changes.items()]
@@ -167,7 +182,7 @@ class TokenManager(OldNames):
         """Make what reads a changed token dirty; return these tokens, whose steps can be run now."""
         self.dirty, self._new = bytearray(self.dirty), set()
         for token in self.changed:
-            self._mark(self.program.slots[token])
+            self.mark(self.program.settable[token])
         return self
 
     def store(self, step: Step, made: Sequence[Any] | None) -> None:
@@ -188,15 +203,18 @@ class TokenManager(OldNames):
         for slot, value in zip(step.outputs, made, strict=True):
             if not is_unchanged(self.values[slot], value, given, self.program.guard):
                 self.values[slot] = value
-                self._mark(slot)
+                self.mark(slot)
 
-    def _mark(self, slot: int) -> None:
+    def mark(self, slot: int) -> None:
         """Take note that a slot has a new value: the steps that read it are dirty."""
         program = self.program
         self._new.add(slot)
         for place in program.consumers[slot]:
-            if not program.switches or slot in program.read_by(program.steps[place], self.values):
+            step = program.steps[place]
+            if step.switch is None or slot in program.read_by(step, self.values):
                 self.dirty[place] = 1
+        for run in program.inside.get(slot, ()) if program.inside else ():
+            self.values[run] = with_new_input(self.values[run], slot)
 
     def forget(self, steps: Iterable[int]) -> None:
         """Make the outputs of these steps read as not computed."""

@@ -67,9 +67,15 @@ def _by_functions(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[
     """Yield controls by the functions that take them, in run order of the first; its own come before shared ones."""
     folders: dict[tuple[str, ...], list[Control]] = {}
     for control in controls:
-        folders.setdefault(tuple(dict.fromkeys(cg.digraph.consumers[control.names[0]])), []).append(control)
+        folders.setdefault(_takers(cg, control.names[0]), []).append(control)
     places = {function: place for place, function in enumerate(cg.functions)}
     yield from sorted(folders.items(), key=lambda folder: (places[folder[0][0]], len(folder[0])))
+
+
+def _takers(cg: CompGraph, name: str) -> tuple[str, ...]:
+    """Return the functions that take a hyperparameter; of one inside a pipeline, the pipeline."""
+    inside = [function for function in cg.functions if name.startswith(f"{function}__")]
+    return tuple(dict.fromkeys(cg.digraph.consumers.get(name, inside[:1])))
 
 
 def _row(control: Control, css: str, functions: tuple[str, ...]) -> dict[str, Any]:

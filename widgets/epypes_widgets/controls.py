@@ -19,6 +19,7 @@ from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 
 from epypes.display.previews.short import short_repr
 from epypes.errors import UnknownName
+from epypes.graph import CompGraph, inside_of
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.ranges import Range, allows, ranges
 from epypes_widgets.scale import Scale, exponent, refused, same_type, scale_of
@@ -61,16 +62,23 @@ class _FloatRange(_Quiet, ipywidgets.FloatRangeSlider): ...
 class Appearance:
     """The layout and the styles of the controls of a panel: one of each, since each is a model in the browser."""
 
-    def __init__(self) -> None:
-        self._layout = ipywidgets.Layout(width="100%")
+    def __init__(self, cg: CompGraph) -> None:
+        self._cg, self._layout = cg, ipywidgets.Layout(width="100%")
         self._styles: dict[type, Any] = {}
 
     def of(self, names: tuple[str, ...], tooltip: str, style: type) -> dict[str, Any]:
         """Return what the constructor of a widget is given: name, tooltip, layout and style."""
         if style not in self._styles:
             self._styles[style] = style(description_width=_DESCRIPTION_WIDTH)
-        text = {"description": " .. ".join(names), "tooltip": tooltip}
+        text = {"description": " .. ".join(map(self._label, names)), "tooltip": tooltip}
         return {**text, "layout": self._layout, "style": self._styles[style]}
+
+    def _label(self, name: str) -> str:
+        """Return a name as it stands in its folder, which is that of a pipeline for what is inside."""
+        if inside_of(self._cg, name)[0] is self._cg:
+            return name
+        prefixes = [f"{function}__" for function in self._cg.functions if name.startswith(f"{function}__")]
+        return name.removeprefix(prefixes[0]) if prefixes else name
 
 
 class Control:
@@ -502,7 +510,7 @@ def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
     """
     values, first, params = runner.hyperparameters, runner.first_hyperparameters, ranges(runner, hints)
     pairs = {along.name: pair for pair in _pairs(params, values) for along in pair}
-    appearance = Appearance()
+    appearance = Appearance(runner.cg)
     made: dict[str, Control] = {}
     for token, param in params.items():
         if token in made:

@@ -138,9 +138,7 @@ def _promoted(runner: CompGraphRunner, to: str, outputs: Sequence[str] | None) -
         return Outcome("promoted", "refused", "Not promoted: name a folder, such as services/edges.", to)
     own, last = runner, runner.last
     if last is not None:
-        own = CompGraphRunner(
-            runner.cg, runner.hyperparameters, guard=runner.guard, check_mutation=runner.check_mutation
-        )
+        own = CompGraphRunner(runner.cg, runner.current.own, guard=runner.guard, check_mutation=runner.check_mutation)
         own.run(**{token: last[token] for token in own.free_source_tokens})
     # What it assumes is in the outcome.
     bundle = promote(own, Path(to.strip()).expanduser(), outputs=outputs, on_progress=lambda text: None)

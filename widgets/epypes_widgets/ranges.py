@@ -11,11 +11,11 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from epypes.catalog import entry_of, fits, parameter_names, range_of, uses, usual
 from epypes.errors import UnknownName
-from epypes.graph import CompGraph, annotated_params, as_switch
+from epypes.graph import CompGraph, annotated_params, as_switch, inner_graph, inside_of
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
 from epypes_widgets.values import as_python, is_integer, is_movable
 
@@ -58,13 +58,55 @@ def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
     for name in hints:
         if name not in values:
             raise UnknownName("hyperparameter", name, values, "of this runner")
-    given = {name: _read(runner, name, hint) for name, hint in hints.items()}
+    return _ranges(runner, {name: _read(runner, name, hint) for name, hint in hints.items()})
+
+
+class _Part(NamedTuple):
+    """The graph of a pipeline, with the hyperparameters that the graph around it gives it."""
+
+    cg: CompGraph
+    hyperparameters: Mapping[str, Any]
+
+
+def _ranges(runner: Tunable | _Part, given: Mapping[str, Param | Roi]) -> dict[str, Range]:
+    values, left = runner.hyperparameters, set(runner.hyperparameters)
+    tokens = [token for token in runner.cg.source_tokens if token in values]
     found = {
-        token: _closed(given[token] if token in given else _guess(runner, token), values[token])
-        for token in runner.cg.source_tokens
-        if token in values
+        token: _closed(given[token] if token in given else _guess(runner, token), values[token]) for token in tokens
     }
-    return _paired(runner, found, given)
+    found = _paired(runner, found, given)
+    left.difference_update(tokens)
+    for name, function in runner.cg.functions.items():
+        prefix, inner = f"{name}__", inner_graph(function)
+        own = {known.removeprefix(prefix): known for known in values if known in left and known.startswith(prefix)}
+        if inner is None or not own:
+            continue
+        left.difference_update(own.values())
+        part = _Part(inner, {token: values[known] for token, known in own.items()})
+        hints = {token: _seen_inside(given[known], prefix) for token, known in own.items() if known in given}
+        taken = dict(zip(_free(part), runner.cg.func_inputs(name), strict=False))
+        for token, param in _ranges(part, hints).items():
+            hinted = given.get(own[token])
+            found[own[token]] = hinted if isinstance(hinted, Roi) else _seen_outside(param, prefix, taken, hinted)
+    return found | {token: _closed(given.get(token) or _guess(runner, token), values[token]) for token in sorted(left)}
+
+
+def _free(part: _Part) -> list[str]:
+    return [t for t in part.cg.source_tokens if t not in part.hyperparameters and t not in part.cg.delays]
+
+
+def _seen_inside(hint: Param | Roi, prefix: str) -> Param | Roi:
+    return replace(hint, below=hint.below.removeprefix(prefix)) if isinstance(hint, Param) else hint
+
+
+def _seen_outside(param: Range, prefix: str, taken: Mapping[str, str], hinted: Param | Roi | None) -> Range:
+    """Return the range of a hyperparameter inside a pipeline with the names that other tokens have around it."""
+    if isinstance(param, Roi):
+        return replace(param, on=taken.get(param.on, ""))
+    if not isinstance(param, Param):
+        return param
+    cuts = param.cuts if hinted is not None else taken.get(param.cuts, "")
+    return replace(param, below=param.below and f"{prefix}{param.below}", cuts=cuts)
 
 
 def allows(param: Param | Roi | Text, value: Any) -> bool:
@@ -165,6 +207,7 @@ class Taker:
 
 def takers(cg: CompGraph, token: str) -> list[Taker]:
     """Return the functions that take a token, in run order."""
+    cg, token = inside_of(cg, token)
     found = []
     for name in cg.digraph.consumers.get(token, ()):
         tokens = dict(zip(parameter_names(cg.functions[name]), cg.func_inputs(name), strict=False))
@@ -176,7 +219,7 @@ def takers(cg: CompGraph, token: str) -> list[Taker]:
 # -- without a hint -------------------------------------------------------------------------------------------------
 
 
-def _guess(runner: Tunable, token: str) -> Range:
+def _guess(runner: Tunable | _Part, token: str) -> Range:
     """Return the range that the graph, the catalog or the value give; what the value does not fit is passed over."""
     value, known = runner.hyperparameters[token], takers(runner.cg, token)
     for source in (_branches, _annotated, _cataloged, _valued):
@@ -187,7 +230,7 @@ def _guess(runner: Tunable, token: str) -> Range:
     return None
 
 
-def _branches(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Param | None:
+def _branches(runner: Tunable | _Part, token: str, value: Any, known: list[Taker]) -> Param | None:
     """Return the branches that a hyperparameter chooses among, in each of its switches."""
     inputs = runner.cg.func_inputs
     switches = [as_switch(taker.function) for taker in known if inputs(taker.name)[0] == token]
@@ -195,7 +238,7 @@ def _branches(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Pa
     return Param(choices=tuple(k for k in branches[0] if all(k in each for each in branches))) if branches else None
 
 
-def _annotated(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Param | Roi | None:
+def _annotated(runner: Tunable | _Part, token: str, value: Any, known: list[Taker]) -> Param | Roi | None:
     """Return a fitting annotation in which parameters of the function are named by the tokens they get."""
     found = next((param for param in annotated_params(runner.cg, token) if allows(param, value)), None)
     tokens = {name: taken for taker in reversed(known) for name, taken in taker.tokens.items()}
@@ -211,7 +254,7 @@ def _annotated(runner: Tunable, token: str, value: Any, known: list[Taker]) -> P
     return replace(found, below=below if below in runner.hyperparameters else "", cuts=named(found.cuts))
 
 
-def _cataloged(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Param | None:
+def _cataloged(runner: Tunable | _Part, token: str, value: Any, known: list[Taker]) -> Param | None:
     found = range_of(runner.cg, token, value)
     cuts = next(filter(None, (_cut_by(runner, taker, token) for taker in known)), "")
     if found is None and cuts:  # what is compared with an image is a threshold, whatever it is called
@@ -221,7 +264,7 @@ def _cataloged(runner: Tunable, token: str, value: Any, known: list[Taker]) -> P
     return replace(found, cuts=cuts) if cuts and found.choices is None else found
 
 
-def _cut_by(runner: Tunable, taker: Taker, token: str) -> str:
+def _cut_by(runner: Tunable | _Part, taker: Taker, token: str) -> str:
     """Return the token whose values a function compares with this one; empty if that is not known."""
     entry, used = entry_of(taker.function, taker.parameter), uses(taker.function, taker.parameter)
     compared = [*([entry.cuts] if entry else []), *(use.cuts for use in used)]
@@ -229,7 +272,7 @@ def _cut_by(runner: Tunable, taker: Taker, token: str) -> str:
     return next((taker.tokens[name] for name in compared if taker.tokens.get(name) in payload), "")
 
 
-def _valued(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Range:
+def _valued(runner: Tunable | _Part, token: str, value: Any, known: list[Taker]) -> Range:
     if isinstance(value, str):
         return Text()
     if isinstance(value, tuple | list):
@@ -249,7 +292,7 @@ def _words(name: str) -> tuple[str, ...]:
 # -- pairs ----------------------------------------------------------------------------------------------------------
 
 
-def _paired(runner: Tunable, found: Mapping[str, Range], given: Mapping[str, Range]) -> dict[str, Range]:
+def _paired(runner: Tunable | _Part, found: Mapping[str, Range], given: Mapping[str, Range]) -> dict[str, Range]:
     """Return ranges in which the lower one of two tokens names the other by ``below``.
 
     A hint's ``below`` is kept, or refused with ValueError. Else two tokens are a pair if they go into one function,
@@ -281,7 +324,7 @@ def _is_pair(values: Mapping[str, Any], low: str, high: str, ranges: Mapping[str
     return is_movable(one) and is_movable(other) and is_integer(one) == is_integer(other) and bool(one <= other)
 
 
-def _named_pairs(runner: Tunable, tokens: list[str]) -> Iterator[tuple[str, str]]:
+def _named_pairs(runner: Tunable | _Part, tokens: list[str]) -> Iterator[tuple[str, str]]:
     """Yield the tokens whose names differ by low and high, and those whose parameters do."""
     for token in tokens:
         for taker in takers(runner.cg, token):

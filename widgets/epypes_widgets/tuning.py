@@ -342,7 +342,7 @@ class Tuning:
         if good is not None:
             self.screen.show(good, 0, failed=run)
         had_failed = bool(self.screen.error)
-        self.screen.fail(str(failure), failure.function, self._at_fault(run, failure.function))
+        self.screen.fail(_failure_text(run, failure), failure.function, self._at_fault(run, failure.function))
         if not had_failed:  # what failed can be undone
             self.screen.send_history()
 
@@ -351,8 +351,8 @@ class Tuning:
         cg, wanted = self.runner.cg, self.session.wanted
         if function not in cg.functions:
             return []  # f_in or f_out of a service
-        takes = cg.func_inputs(function)
-        behind = subgraph(cg, takes).tokens
+        behind = subgraph(cg, cg.func_inputs(function)).tokens
+        takes = (*cg.func_inputs(function), *_taken_inside(run))
         given = [name for name in takes if name in wanted] or [name for name in wanted if name in behind]
         return given or [name for name in takes if name in run.hyperparameters]
 
@@ -406,3 +406,20 @@ class Tuning:
         if entry is None:
             raise LookupError(f"No entry {comparison.number} in the history.")
         return entry.values, f"history {entry.number}"
+
+
+def _failure_text(run: Run, failure: Failure) -> str:
+    """Say what failed; inside a pipeline, after its name."""
+    inner = run.nested.get(failure.function)
+    if inner is None or inner.failure is None:
+        return str(failure)
+    return f"{failure.function}: {_failure_text(inner, inner.failure)}"
+
+
+def _taken_inside(run: Run) -> list[str]:
+    """Return what the function takes that has failed inside a pipeline."""
+    inner = run.nested.get(run.failure.function) if run.failure is not None else None
+    if run.failure is None or inner is None or inner.failure is None:
+        return []
+    names = (*inner.cg.func_inputs(inner.failure.function), *_taken_inside(inner))
+    return [f"{run.failure.function}__{name}" for name in names]

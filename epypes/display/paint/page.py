@@ -46,6 +46,8 @@ _SVG_URI: Final = "data:image/svg+xml,"
 _IN_URI: Final = {sign: f"%{ord(sign):02X}" for sign in '%#&"\n\r\t'}  # % comes first
 _THUMBNAIL: Final = re.compile('<image [^>]*>|<g class="chart">.*?</g>')
 _END: Final = "</figure>"
+# Below the picture stands what is inside.
+_OPENED: Final = ("group", "pipeline")
 _WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
 
 
@@ -208,7 +210,7 @@ def _data(graph: GraphView, kept: Mapping[Texts, Sequence[int]]) -> str:
         io[edge.function][0 if edge.is_input else 1].append(edge.token if edge.is_live else ~edge.token)
     data = {
         "io": io,
-        "groups": {place: each.name for place, each in enumerate(graph.functions) if each.kind == "group"},
+        "groups": {place: each.name for place, each in enumerate(graph.functions) if each.kind in _OPENED},
         "about": [owner.get(place, _unexplained(each)) for place, each in enumerate(graph.functions)],
         "texts": list(kept),
         "images": {place: each.name for place, each in enumerate(graph.tokens) if has_picture(each)},

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from statistics import fmean
 from typing import Final
 
-from epypes.display.layout import Edge, Layout, Point, lay_out
+from epypes.display.layout import FRAME_PX, Box, Edge, Layout, Point, lay_out
 from epypes.display.paint.style import STYLE
 from epypes.display.paint.vertices import (
     LINE_PX,
@@ -27,7 +27,7 @@ from epypes.display.paint.vertices import (
     token_box,
 )
 from epypes.display.text import content, escape, fitted, short_name
-from epypes.display.views.graphview import EdgeView, GraphView, StageView
+from epypes.display.views.graphview import EdgeView, FrameView, GraphView, StageView
 from epypes.display.views.groups import function_count
 from epypes.wording import counted
 
@@ -173,6 +173,26 @@ def _paint_around(graph: GraphView, layout: Layout) -> tuple[list[str], Bounds]:
     return parts, covered
 
 
+def _members(frame: FrameView, places: Mapping[str, int]) -> tuple[int, ...]:
+    names = (*(f"function {name}" for name in frame.function_names), *(f"token {name}" for name in frame.token_names))
+    return tuple(places[name] for name in names if name in places)
+
+
+def _paint_inside(title: str, boxes: Sequence[Box], layout: Layout, members: Sequence[int]) -> tuple[list[str], Bounds]:
+    """Paint the frame around what is inside a pipeline; return what it covers, too."""
+    sizes = [(*layout.centres[at], boxes[at].width / 2 + _TITLE_PX / 2, boxes[at].height / 2) for at in members]
+    frame = Bounds(
+        min(x - across for x, _, across, _ in sizes),
+        min(y - down for _, y, _, down in sizes) - FRAME_PX + _TITLE_PX / 2,
+        max(x + across for x, _, across, _ in sizes),
+        max(y + down for _, y, _, down in sizes) + _TITLE_PX / 2,
+    )
+    left, top = frame.left + _PADDING_PX, frame.top - _TITLE_PX / 2
+    label = Bounds(left, top, left + text_width(short_name(title)), top + _TITLE_PX)
+    frame = frame.holding(Bounds(frame.left, frame.top, label.right + _PADDING_PX, frame.bottom))
+    return _paint_frame(title, frame, label), frame.holding(label)
+
+
 def _paint_frame(title: str, frame: Bounds, label: Bounds) -> list[str]:
     """Paint the frame, and the title on a label that lies on its upper border."""
     size = f'width="{frame.right - frame.left:.1f}" height="{frame.bottom - frame.top:.1f}"'
@@ -271,8 +291,14 @@ def paint_svg(graph: GraphView) -> str:
     ])  # fmt: skip
     place = {token.name: functions + index for index, token in enumerate(graph.tokens)}
     back = tuple((place[token], place[to]) for token, to in graph.delays if token in place and to in place)
-    layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction, back)
+    places = {f"function {each.name}": index for index, each in enumerate(graph.functions)}
+    places |= {f"token {name}": at for name, at in place.items()}
+    frames = tuple(filter(None, (_members(frame, places) for frame in graph.frames)))
+    layout = lay_out(boxes, ends, len(ends) > max(_MANY_EDGES, _DENSE * len(boxes)), direction, back, frames)
     around, bounds = _paint_around(graph, layout)
+    for frame, members in zip(graph.frames, frames, strict=False):
+        painted, taken = _paint_inside(frame.name, boxes, layout, members)
+        around, bounds = around + painted, bounds.holding(taken)
     width, height = bounds.right - bounds.left + 2 * _MARGIN, bounds.bottom - bounds.top + 2 * _MARGIN
     size = f"{width:.0f}", f"{height:.0f}"
     box = f"{bounds.left - _MARGIN:.4g} {bounds.top - _MARGIN:.4g} {size[0]} {size[1]}"

@@ -201,7 +201,7 @@ def _function_lines(function: FunctionView) -> tuple[str, ...]:
         lines = ("failed", *wrapped(function.message, _MESSAGE_CHARACTERS, _MESSAGE_LINES))
     elif function.state == "planned":
         lines = "to run", *wrapped(function.message, _REASON_CHARACTERS, _REASON_LINES)
-    return (short_name(function.name), *function.notes, *lines)
+    return (short_name(function.label or function.name), *function.notes, *lines)
 
 
 def _state_text(function: FunctionView) -> str:
@@ -255,7 +255,7 @@ _COUNT: Final = re.compile(r"\b\d+\b")
 @lru_cache(_MOST_KEPT)
 def token_box(token: TokenView) -> Box:
     """Return the shape and size of a token."""
-    name, kind = short_name(token.name), _kind(token)
+    name, kind = short_name(token.label or token.name), _kind(token)
     if kind == "thumbnail":
         return Box("box", max(THUMB_WIDTH + 12, text_width(name)), THUMB_HEIGHT + 2 * LINE_PX + 16)
     if kind == "rows":
@@ -271,7 +271,7 @@ def token_box(token: TokenView) -> Box:
 def paint_token(token: TokenView, box: Box, centre: Point) -> str:
     """Paint a token as an element with its title."""
     x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
-    name, kind, thumbnail = short_name(token.name), _kind(token), ""
+    name, kind, thumbnail = short_name(token.label or token.name), _kind(token), ""
     second = _second_line(token, kind)
     if box.shape == "box":
         body = _rectangle(x, y, box.width, box.height, radius=10)

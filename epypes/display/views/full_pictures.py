@@ -55,7 +55,10 @@ def run_of(shown: Any) -> Run | None:
 def kept_pictures(graph: GraphView, run: Run) -> dict[str, Picture]:
     """Return by token the pictures that a page keeps, as far as they fit: of sinks, of sources, then of others."""
     sinks, producer = frozenset(run.cg.sink_tokens), run.cg.digraph.producer
-    ranked = sorted(drawn_tokens(graph), key=lambda token: 0 if token.name in sinks else 1 + (token.name in producer))
+    # Tokens inside pipelines have their thumbnails alone.
+    known = run.tokens.program.slots
+    own = [token for token in drawn_tokens(graph) if token.name in known]
+    ranked = sorted(own, key=lambda token: 0 if token.name in sinks else 1 + (token.name in producer))
     left, kept = KEPT_CHARACTERS, dict[str, Picture]()
     for token in ranked:
         most_bytes = min(_KEPT_BYTES, left * 3 // 4)

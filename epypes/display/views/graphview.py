@@ -37,6 +37,8 @@ class TokenView(NamedTuple):
         The function that says the order; empty if it is assumed.
     delayed
         The token whose value in the run before it has; empty for all other tokens.
+    label
+        What stands on it in place of its name: inside the frame of a pipeline, its name there.
     """
 
     name: str
@@ -47,6 +49,7 @@ class TokenView(NamedTuple):
     first: str = ""
     order_by: str = ""
     delayed: str = ""
+    label: str = ""
 
 
 def has_picture(token: TokenView) -> bool:
@@ -70,6 +73,8 @@ class FunctionView(NamedTuple):
         Whether its name now means another function, or that of a function inside it does.
     signature, source
         Its parameters, and the first lines of its source; empty where they can't be found.
+    label
+        What stands on it in place of its name: inside the frame of a pipeline, its name there.
     """
 
     name: str
@@ -82,6 +87,7 @@ class FunctionView(NamedTuple):
     is_redefined: bool = False
     signature: str = ""
     source: str = ""
+    label: str = ""
 
 
 class StageView(NamedTuple):
@@ -99,6 +105,14 @@ class StageView(NamedTuple):
     name: str
     state: Literal["static", "running", "stopped", "failed"] = "static"
     notes: tuple[str, ...] = ()
+
+
+class FrameView(NamedTuple):
+    """A pipeline of which the inside is drawn: its name, and those of the functions and tokens in its frame."""
+
+    name: str
+    function_names: tuple[str, ...]
+    token_names: tuple[str, ...]
 
 
 class EdgeView(NamedTuple):
@@ -138,11 +152,13 @@ class GraphView:
     before, after
         The stages that an event passes before and after the graph.
     groups
-        What is inside the vertices of kind ``"group"``, by their names.
+        What is inside the vertices of kind ``"group"`` and ``"pipeline"``, by their names.
     direction
         Where the data flows to on the page.
     delays
         Pairs of a token and the one that has its value in the next run.
+    frames
+        Around what is inside a pipeline, the outer ones first.
     """
 
     functions: tuple[FunctionView, ...]
@@ -155,6 +171,7 @@ class GraphView:
     groups: tuple[GroupView, ...] = ()
     direction: Direction = "down"
     delays: tuple[tuple[str, str], ...] = ()
+    frames: tuple[FrameView, ...] = ()
 
     @property
     def draws_edges(self) -> bool:
@@ -215,6 +232,7 @@ _RECORDS: Final[dict[str, type]] = {
     "before": StageView,
     "after": StageView,
     "groups": GroupView,
+    "frames": FrameView,
     "graph": GraphView,
     "preview": Preview,
     "picture": Picture,

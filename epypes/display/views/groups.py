@@ -207,7 +207,8 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
 
 def function_count(graph: GraphView) -> int:
     """Return how many functions there are, those inside groups included."""
-    return len(graph.functions) + sum(len(group.graph.functions) - 1 for group in graph.groups)
+    groups = {function.name for function in graph.functions if function.kind == "group"}
+    return len(graph.functions) + sum(len(each.graph.functions) - 1 for each in graph.groups if each.name in groups)
 
 
 # -- stretches of a graph that is too large for a page ----------------------------------------------------------------

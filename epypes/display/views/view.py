@@ -5,7 +5,7 @@ Painters read the frozen GraphView and nothing else, so their colours and labels
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, get_args
 
@@ -20,8 +20,10 @@ from epypes.display.text import (
     overhead_text,
     short_name,
 )
-from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView, TokenState
+from epypes.display.views.graphview import Direction, FunctionView, GraphView, GroupView, StageView, TokenState
 from epypes.display.views.groups import MOST_SHOWN, collapsed, folded, groups_of, outside_tokens, twice_seen
+from epypes.display.views.pipelines import Inside, insides_of
+from epypes.display.views.pipelines import opened as with_inside
 from epypes.display.views.structure import structure_of
 from epypes.display.views.tokens import ROOM, HyperparameterValues, Room, token_views
 from epypes.errors import UnknownName, run_call
@@ -47,6 +49,7 @@ def view(
     thumbnails: int = MOST_THUMBNAILS,
     open: str | Iterable[str] = (),  # noqa: A002 - the word for what is done to a box
     collapse: bool = True,
+    depth: int = 0,
 ) -> GraphView:
     """Look at a graph, a runner, a run, a plan or a pipeline; nothing is computed but previews.
 
@@ -54,7 +57,7 @@ def view(
     ----------
     shown
         What is looked at.
-    direction, thumbnails, open, collapse
+    direction, thumbnails, open, collapse, depth
         As for ``ep.show``.
 
     Raises
@@ -62,26 +65,36 @@ def view(
     TypeError, ValueError
         An argument is of another kind, or none of these.
     UnknownName
-        There is no such group.
+        There is no such group, and no such pipeline.
     """
-    _require_options(direction, thumbnails, collapse)
+    _require_options(direction, thumbnails, collapse, depth)
     cg = _graph_of(shown)
     groups = groups_of(cg.functions, cg.groups)
     grouped = {name for inside in groups.values() for name in inside}
     if len(cg.functions) - len(grouped) + len(groups) > MOST_SHOWN:
         groups |= folded(cg, grouped)
-    opened = names_of("open", open)
+    opened, pipelines = names_of("open", open), {inside.name: inside for inside in _insides(shown)}
     for name in opened:
-        if name not in groups:
-            raise UnknownName("group", name, groups, "in this picture")
+        if name not in groups and name not in pipelines:
+            kind = "group or pipeline" if pipelines else "group"
+            raise UnknownName(kind, name, (*groups, *pipelines), "in this picture")
     closed = {name: inside for name, inside in groups.items() if collapse and name not in opened}
     characters = THUMBNAIL_CHARACTERS - CHARACTERS_OF_A_VERTEX * twice_seen(cg, closed)
-    graph = _whole(shown, Room(thumbnails, max(characters, _LEAST_CHARACTERS)), closed)
+    room = Room(thumbnails, max(characters, _LEAST_CHARACTERS))
+    to_open = [name for name in pipelines if _is_open(name, pipelines[name], opened, depth)]
+    to_open = [name for name in to_open if not any(name in inside for inside in closed.values())]
+    part = Room(thumbnails, room.characters // (len(to_open) + 1))
+    graph = _whole(shown, part, closed)
+    for name in to_open:
+        graph = with_inside(graph, pipelines[name], _inside_view(shown, pipelines[name], part))
+    drawn = [frame.name for frame in graph.frames]
     graph = collapsed(graph if graph.direction == direction else replace(graph, direction=direction), closed)
+    if pipelines:
+        graph = _with_closed(shown, graph, [inside for name, inside in pipelines.items() if name not in drawn], room)
     return graph if graph.draws_edges else _captioned(graph, f"{len(graph.edges):,} edges, too many to be drawn")
 
 
-def _require_options(direction: object, thumbnails: object, collapse: object) -> None:
+def _require_options(direction: object, thumbnails: object, collapse: object, depth: object) -> None:
     if not isinstance(direction, str) or direction not in get_args(Direction):
         raise ValueError(f'direction must be "down" or "right", not {direction!r:.60}.')
     if isinstance(thumbnails, bool) or not isinstance(thumbnails, int):
@@ -90,6 +103,8 @@ def _require_options(direction: object, thumbnails: object, collapse: object) ->
         raise ValueError(f"thumbnails must be 0 or more, not {thumbnails}.")
     if not isinstance(collapse, bool):
         raise TypeError(f"collapse must be True or False, not {collapse!r:.60}; open=[...] names groups.")
+    if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:
+        raise ValueError(f"depth is how many levels of pipelines are drawn open, 0 or more, not {depth!r:.60}.")
 
 
 def _graph_of(shown: Any) -> CompGraph:
@@ -127,6 +142,56 @@ def _whole(shown: Any, room: Room, closed: Mapping[str, Sequence[str]]) -> Graph
 def _captioned(graph: GraphView, text: str, **changes: Any) -> GraphView:
     """Return a view whose caption begins with this text and goes on with the one that it has."""
     return replace(graph, caption=f"{text}. {graph.caption}" if graph.caption else text, **changes)
+
+
+# -- what is inside pipelines ---------------------------------------------------------------------------------------
+
+
+def _insides(shown: Any) -> Iterator[Inside]:
+    if isinstance(shown, CompGraph):
+        yield from insides_of(shown, {}, {}, None)
+    elif isinstance(shown, Run):
+        yield from insides_of(shown.cg, shown.hyperparameters, shown.first_hyperparameters, shown.tokens)
+    elif isinstance(shown, Plan):
+        yield from insides_of(shown.cg, shown.hyperparameters, shown.first_hyperparameters, None)
+    else:
+        runner = shown if isinstance(shown, CompGraphRunner) else shown.runner
+        yield from insides_of(runner.cg, runner.hyperparameters, runner.first_hyperparameters, runner.tokens_now)
+
+
+def _is_open(name: str, inside: Inside, opened: Collection[str], depth: int) -> bool:
+    return inside.depth < depth or any(each == name or each.startswith(f"{name}__") for each in opened)
+
+
+def _inside_view(shown: Any, inside: Inside, room: Room) -> GraphView:
+    """Look at what is inside a pipeline."""
+    hparams, run = HyperparameterValues(inside.values, inside.first), inside.run
+    if run is None or inside.tokens is None:
+        structure = structure_of(inside.runner.cg, {}, ())
+        is_static = isinstance(shown, CompGraph | Plan)
+        tokens, _ = token_views(structure, hparams, lambda _: "static" if is_static else "not computed", room)
+        if is_static:
+            return replace(structure, tokens=tokens)
+        functions = tuple(function._replace(state="not run") for function in structure.functions)
+        return replace(structure, functions=functions, tokens=tokens)
+    steps = inside.tokens.program.steps
+    stale = frozenset(steps[place].name for place in inside.tokens.stale)
+    graph = _run_view(run, _run_structure(run), hparams, stale, room, {})
+    return _running(graph, inside.runner.running) if isinstance(shown, CompGraphRunner) else graph
+
+
+def _with_closed(shown: Any, graph: GraphView, closed: Sequence[Inside], room: Room) -> GraphView:
+    """Add what is inside pipelines that are drawn closed, with thumbnails as far as the picture has left room."""
+    seen = {function.name for part in (graph, *(group.graph for group in graph.groups)) for function in part.functions}
+    closed = [inside for inside in closed if inside.name in seen]
+    if not closed:
+        return graph
+    shown_now = [token.preview.picture for token in graph.tokens if token.preview is not None]
+    left = room.characters - sum(len(picture.data) * 4 // 3 for picture in shown_now if picture is not None)
+    part = Room(room.thumbnails, max(left, 0) // len(closed))
+    views = ((inside.name, _inside_view(shown, inside, part)) for inside in closed)
+    more = tuple(GroupView(name, replace(inner, direction=graph.direction)) for name, inner in views)
+    return replace(graph, groups=(*graph.groups, *more))
 
 
 # -- runs and runners ----------------------------------------------------------------------------------------------
@@ -183,7 +248,7 @@ def _run_functions(run: Run, functions: Iterable[FunctionView], stale: Collectio
     for function in functions:
         name, entry = function.name, entries.get(function.name)
         if failure and failure.function == name:
-            duration_ns, message = entry.duration_ns if entry else None, failure.message or failure.kind
+            duration_ns, message = entry.duration_ns if entry else None, failure_text(run)
             function = function._replace(state="failed", duration_ns=duration_ns, message=message)
         elif function.state == "left out":
             pass
@@ -203,6 +268,18 @@ def _run_functions(run: Run, functions: Iterable[FunctionView], stale: Collectio
     return tuple(seen)
 
 
+def failure_text(run: Run) -> str:
+    """Return the message of a run's failure; of one inside a pipeline, after the name of the function that failed."""
+    failure = run.failure
+    if failure is None:
+        return ""
+    inner = run.nested.get(failure.function)
+    text = failure_text(inner) if inner is not None else ""
+    if inner is not None and inner.failure is not None and text:
+        return f"{inner.failure.function}: {text}"
+    return failure.message or failure.kind
+
+
 def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     # First, so that what ends meanwhile shows as running, not as never run.
     running, last, plan = runner.running, runner.last, runner.plan()
@@ -217,6 +294,11 @@ def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Seque
         )
         tokens, _ = token_views(structure, hparams, lambda name: "not computed", room)
         graph = _captioned(structure, "not run yet", functions=functions, tokens=tokens)
+    return _running(graph, running)
+
+
+def _running(graph: GraphView, running: Collection[str]) -> GraphView:
+    """Mark the functions that are being run at this moment."""
     if not running:
         return graph
     functions = tuple(
