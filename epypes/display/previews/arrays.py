@@ -6,8 +6,17 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
-from epypes.display.previews.drawing import bar_chart, line_chart, point_sketch, quad_sketch, segment_sketch
+from epypes.display.previews.drawing import bar_chart, line_chart
 from epypes.display.previews.encoding import encode_small, is_pooled, pillow_image
+from epypes.display.previews.features import (
+    circle_sketch,
+    flow_sketch,
+    has_flow_shape,
+    point_sketch,
+    quad_sketch,
+    says_circles,
+    segment_sketch,
+)
 from epypes.display.previews.images import (
     few_of,
     image_kind,
@@ -64,7 +73,7 @@ def array_sketch(array: Any, look: Look) -> Sketch | Preview:
         return record_sketch(array)
     if array.dtype.kind not in "biuf" or not array.size:
         return _plain(array)
-    closer = _closer(array)
+    closer = _closer(array, look)
     if closer is None:
         return _plain(array)
     text = array_text(array) + _order_text(array, look) * (closer is image_sketch)
@@ -73,14 +82,23 @@ def array_sketch(array: Any, look: Look) -> Sketch | Preview:
     return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
 
 
-def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
+def _closer(array: Array, look: Look) -> Callable[[Array, Look], Sketch | None] | None:
     """Return what draws an array of its shape; None if nothing can be drawn."""
     if is_image(array) and not is_strip(array):
         return image_sketch
     if array.shape[1:] in _PLACES:
         return _places
+    if has_flow_shape(array):
+        return flow_sketch
+    is_of_hough = array.ndim == 3 and array.dtype.str[1:] == "f4"
+    if _has_circle_shape(array) and (is_of_hough or says_circles(look)):
+        return circle_sketch
     is_line = array.size == max(array.shape) > _SMALL_SIDE
     return _drawn_numbers if is_line else None
+
+
+def _has_circle_shape(array: Array) -> bool:
+    return array.shape[-1] == 3 and array.dtype.itemsize > 1 and (array.ndim == 2 or array.shape[:-2] == (1,))
 
 
 def is_strip(array: Array) -> bool:

@@ -12,16 +12,18 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
+from types import CodeType
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews import Backdrop, Look, Most, Scene, Surroundings
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.drawing import are_keypoints, no_marks
+from epypes.display.previews.features import are_keypoints, no_marks
 from epypes.display.previews.images import Range, display_range, image_kind, is_image, own_range, sampled
 from epypes.display.previews.introspection import kind_name
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
+from epypes.graph.identity import innermost
 from epypes.run import CompGraphRunner, Run
 from epypes.run.program import Program
 
@@ -90,6 +92,14 @@ class RunSurroundings(Surroundings):
 
     def __init__(self, run: Run, token: str, *, keeps_ranges: bool = True) -> None:
         self._run, self._token, self._keeps_ranges = run, token, keeps_ranges
+        self.name = token
+
+    def maker_names(self) -> frozenset[str]:
+        """Return the name of the function that made the token, and those in its code."""
+        maker = self._run.cg.digraph.producer.get(self._token)
+        if maker is None:
+            return frozenset()
+        return _names_in(getattr(innermost(self._run.cg.functions[maker]), "__code__", None)) | {maker}
 
     def range_of(self, image: Any, token: str = "") -> Range:
         """Return which values of a token's image are black and white; without one, of this token's."""
@@ -180,6 +190,13 @@ class RunSurroundings(Surroundings):
         return Backdrop(value, colour_order(self._run.cg, token), self.range_of(value, token), token)
 
 
+def _names_in(code: object) -> frozenset[str]:
+    """Return the names that code uses, that of its comprehensions and inner functions included."""
+    if type(code) is not CodeType:
+        return frozenset()
+    return frozenset(code.co_names).union(*map(_names_in, code.co_consts))
+
+
 def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:
     """Return a token as an image, and its marks if it is what was found in one; never raises for a value.
 
@@ -188,7 +205,8 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
     run
         Its tokens' values.
     token
-        An image, what a preview function shows as an image, or keypoints, contours, boxes, segments, points, matches.
+        An image, what a preview function shows as an image, or keypoints, contours, boxes, circles, segments, points,
+        matches, optical flow.
     most
         How many marks there are at most; without, as many as on a thumbnail.
     had_marks
