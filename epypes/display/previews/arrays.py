@@ -22,6 +22,7 @@ from epypes.display.previews.images import (
     image_kind,
     is_image,
     is_of_dtype,
+    label_areas,
     label_text,
     one_channel,
     sampled,
@@ -31,7 +32,7 @@ from epypes.display.previews.images import (
 from epypes.display.previews.introspection import is_of
 from epypes.display.previews.objects import record_sketch
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
-from epypes.display.text import cut
+from epypes.display.text import cut, memory_text
 from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
@@ -115,7 +116,9 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     text = array_text(array) + _order_text(array, look)
     detail, note = [text, statistics_text(sample, array)], ""
     if kind == "labels":
-        detail.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
+        # Labels are names: their range and mean say nothing.
+        areas = label_areas(one_channel(sample), array.size)
+        detail[1:] = [label_text(areas, is_sample=sample is not array), memory_text(array.nbytes)]
     elif kind == "mask":
         detail.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
     elif not is_of_dtype(array.dtype, ends):
