@@ -194,7 +194,9 @@ def test_a_short_list_says_boxes_only_once_they_are_known() -> None:
     texts = {}
     for name in ("boxes", "counts"):
         cg = ep.CompGraph({"look": lambda image: SPREAD}, {"look": ("image", name)})
-        texts[name] = {token.name: token.preview for token in view(ep.CompGraphRunner(cg).run(image=disks())).tokens}[name]
+        texts[name] = {token.name: token.preview for token in view(ep.CompGraphRunner(cg).run(image=disks())).tokens}[
+            name
+        ]
     assert (texts["boxes"].text, texts["counts"].text) == ("2 boxes", "list of 2")
     assert "list of 2 boxes (x, y, width, height), drawn over image" in texts["boxes"].detail
 

@@ -14,6 +14,7 @@ from epypes.display import Backdrop, is_image, scene_of
 from epypes.display.previews.images import image_kind, label_areas, label_text, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
 from epypes.run import Run
+from epypes_widgets.picture_settings import NO_LIMITS, Limits, within_limits
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,11 +28,11 @@ MOST_PX: Final = 262_144
 _COLOURS: Final = {"bgr": "BGR", "rgb": "RGB"}
 
 
-def histogram_of(run: Run, token: str) -> dict[str, Any] | None:
-    """Return the histogram of a token that is an image and up to date; None of any other."""
+def histogram_of(run: Run, token: str, limits: Limits = NO_LIMITS) -> dict[str, Any] | None:
+    """Return the histogram of a token that is an image and up to date, within its limits; None of any other."""
     is_shown = is_image(run.tokens.values[run.tokens.program.slots[token]])
     scene = scene_of(run, token) if is_shown else None
-    return None if scene is None else histogram(scene.backdrop)
+    return None if scene is None else histogram(within_limits(scene.backdrop, limits))
 
 
 def histogram(seen: Backdrop) -> dict[str, Any]:
@@ -40,7 +41,8 @@ def histogram(seen: Backdrop) -> dict[str, Any]:
     Parameters
     ----------
     seen
-        The image, at most so many pixels of which are counted: evenly spread ones. Masks are counted whole, labels up to 1 MP.
+        The image, at most so many pixels of which are counted: evenly spread ones. Masks are counted whole, labels
+        up to 1 MP.
 
     Returns
     -------

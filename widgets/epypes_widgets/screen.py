@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import count
 from typing import Any, Final
@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
+from epypes_widgets.picture_settings import Limits, PictureSettings
 from epypes_widgets.session import Session, Tunable
 from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
 from epypes_widgets.values import is_same, json_values
@@ -60,6 +61,8 @@ class Shown:
         Whether the histogram of the picture is shown.
     cut
         The tokens whose histograms are shown with thresholds on them.
+    pictures
+        How pictures are shown, by the token of the image.
     """
 
     token: str | None = None
@@ -67,6 +70,16 @@ class Shown:
     comparison: Comparison | None = None
     has_histogram: bool = False
     cut: tuple[str, ...] = ()
+    pictures: Mapping[str, PictureSettings] = field(default_factory=dict)
+
+    def settings(self, token: str | None) -> PictureSettings:
+        """Return how the picture of a token is shown."""
+        return self.pictures.get(token or "", PictureSettings())
+
+    @property
+    def limits(self) -> Limits:
+        """The values that are shown black and white, by token, where they were set."""
+        return {token: each.limits for token, each in self.pictures.items() if each.limits is not None}
 
     @property
     def other(self) -> str:
@@ -77,7 +90,8 @@ class Shown:
     def targets(self) -> tuple[str, ...]:
         """The tokens that must be computed, the big picture's first."""
         cut = self.cut if self.has_histogram else ()
-        return tuple(dict.fromkeys(token for token in (self.token, self.other, *self.pinned, *cut) if token))
+        shown = (self.token, self.settings(self.token).over, self.other, *self.pinned, *cut)
+        return tuple(dict.fromkeys(token for token in shown if token))
 
     def within(self, stages: Stages, run: Run) -> Shown:
         """Return what of this can be shown with these stages; another big picture if this one can't."""
@@ -133,7 +147,7 @@ class Screen:
     ) -> None:
         self.view = view
         before = _last_shown.get(session.runner, Shown())
-        self.shown = Shown(asked or before.token, before.pinned, has_histogram=bool(cut), cut=cut)
+        self.shown = Shown(asked or before.token, before.pinned, None, bool(cut), cut, before.pictures)
         self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
@@ -156,6 +170,14 @@ class Screen:
         """Replace parts of what is shown."""
         with self._lock:
             self.shown = _last_shown[self._session.runner] = replace(self.shown, **parts)
+
+    def change_picture(self, token: str, change: Mapping[str, Any]) -> None:
+        """Change how the picture of a token is shown; ValueError or UnknownName if it can't be shown so."""
+        cg = self._session.runner.cg
+        for name in filter(None, (token, change.get("over"))):
+            cg.require_token(name)
+        changed = PictureSettings.of({**self.shown.settings(token).content, **change})
+        self.change(pictures={**self.shown.pictures, token: changed})
 
     def require_stage(self, token: str) -> str:
         """Return the token; LookupError if it is no stage."""
@@ -222,7 +244,7 @@ class Screen:
     def refer(self, key: object, payload: Sequence[Any], label: str, run: Run, token: str) -> None:
         """Show a token of another run to compare with."""
         self._referred = key, tuple(payload)
-        described, data = picture(run, token, "other", had_pictures=self._pictures)
+        described, data = picture(run, token, "other", had_pictures=self._pictures, limits=self.shown.limits)
         content = {"seq": self._seq(), "label": label, "picture": described}
         self.tell("reference", content, (data,) if data else ())
 
@@ -252,6 +274,7 @@ class Screen:
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
+            "pictures": {token: each.content for token, each in shown.pictures.items()},
             "closed": self._is_closed,
         }
         self.view.tell("setup", setup, buffers)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from epypes.display.previews.images import Range, display_range
+from epypes.display.previews.images import ImageKind, Range, display_range
 from epypes.images import Order
 from epypes.optional import LazyModule
 
@@ -39,12 +39,15 @@ class Picture:
         ``"image/jpeg"`` or ``"image/png"``.
     width, height
         Its size, in pixels.
+    kind
+        What the image was seen as.
     """
 
     data: bytes = field(repr=False)
     media_type: str
     width: int
     height: int
+    kind: ImageKind = "photograph"
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,19 +57,23 @@ def _kept_range(program: Program, token: str, image: Array) -> Range:
     return ranges.setdefault(key, found)
 
 
-def reset_display_ranges(shown: Any) -> None:
+def reset_display_ranges(shown: Any, token: str | None = None) -> None:
     """Forget which values are shown black and white; those of the next images are kept instead.
 
     Parameters
     ----------
     shown
-        A runner, a run or a pipeline; of all its tokens.
+        A runner, a run or a pipeline.
+    token
+        Of which token; without, of all.
     """
     runner = getattr(shown, "runner", shown)
     run = runner.last if isinstance(runner, CompGraphRunner) else runner
     if isinstance(run, Run):
         with _lock:
-            _ranges.pop(run.tokens.program, None)
+            kept = _ranges.pop(run.tokens.program, {})
+            if token is not None:
+                _ranges[run.tokens.program] = {key: ends for key, ends in kept.items() if key[0] != token}
     elif not isinstance(runner, CompGraphRunner):
         raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
 
