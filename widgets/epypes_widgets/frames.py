@@ -16,7 +16,7 @@ from epypes.images import has_colours
 from epypes.run import Run
 from epypes_widgets.histogram import histogram_of
 from epypes_widgets.picture_settings import NO_LIMITS, Limits, within_limits
-from epypes_widgets.values import json_values
+from epypes_widgets.values import json_values, short_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -115,9 +115,14 @@ def make_frame(
         "pictures": [described for described, _ in pictures],
         "histogram": histogram_of(run, token, limits) if shown.has_histogram else None,
         "histograms": {cut: histogram_of(run, cut, limits) for cut in shown.cut} if shown.has_histogram else {},
+        "scalars": [{"token": name, "text": short_text(run[name])} for name in shown.scalars if _is_fresh(run, name)],
         **content,
     }
     return Frame(seq, content, tuple(data for _, data in pictures if data), changed_ns)
+
+
+def _is_fresh(run: Run, token: str) -> bool:
+    return run.tokens.is_computed(token) and not run.tokens.is_stale(token)
 
 
 def _alike(run: Run, token: str, size: tuple[int, int], pictures: Container[str]) -> list[str]:

@@ -68,6 +68,7 @@ class Messages:
             "pin": self._pin,
             "compare": self._compare,
             "histogram": lambda message: tuning.look(has_histogram=bool(message["on"])),
+            "scalars": lambda message: tuning.look(has_scalars=bool(message["on"])),
             "probe": self._probe,
             "picture": self._picture,
             "undo": lambda _: tuning.go_to(tuning.history.undo),

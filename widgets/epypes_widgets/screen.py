@@ -15,7 +15,7 @@ from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
 from epypes_widgets.picture_settings import Limits, PictureSettings
 from epypes_widgets.session import Session, Tunable
-from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
+from epypes_widgets.stages import NO_STAGES, Stages, best_stage, scalars, stages, states
 from epypes_widgets.values import is_same, json_values
 from epypes_widgets.view import PictureView
 
@@ -63,6 +63,10 @@ class Shown:
         The tokens whose histograms are shown with thresholds on them.
     pictures
         How pictures are shown, by the token of the image.
+    has_scalars
+        Whether the numbers that belong to the big picture are written on it.
+    scalars
+        The tokens of these numbers.
     """
 
     token: str | None = None
@@ -71,6 +75,14 @@ class Shown:
     has_histogram: bool = False
     cut: tuple[str, ...] = ()
     pictures: Mapping[str, PictureSettings] = field(default_factory=dict)
+    has_scalars: bool = False
+    scalars: tuple[str, ...] = ()
+
+    def with_scalars(self, run: Run | None) -> Shown:
+        """Return it with the numbers that belong to the big picture, as far as a run shows which these are."""
+        if not self.has_scalars or self.token is None or run is None:
+            return replace(self, scalars=())
+        return replace(self, scalars=scalars(run, self.token))
 
     def settings(self, token: str | None) -> PictureSettings:
         """Return how the picture of a token is shown."""
@@ -90,7 +102,7 @@ class Shown:
     def targets(self) -> tuple[str, ...]:
         """The tokens that must be computed, the big picture's first."""
         cut = self.cut if self.has_histogram else ()
-        shown = (self.token, self.settings(self.token).over, self.other, *self.pinned, *cut)
+        shown = (self.token, self.settings(self.token).over, self.other, *self.pinned, *cut, *self.scalars)
         return tuple(dict.fromkeys(token for token in shown if token))
 
     def within(self, stages: Stages, run: Run) -> Shown:
@@ -148,6 +160,7 @@ class Screen:
         self.view = view
         before = _last_shown.get(session.runner, Shown())
         self.shown = Shown(asked or before.token, before.pinned, None, bool(cut), cut, before.pictures)
+        self.shown = replace(self.shown, has_scalars=before.has_scalars)
         self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
@@ -169,7 +182,8 @@ class Screen:
     def change(self, **parts: Any) -> None:
         """Replace parts of what is shown."""
         with self._lock:
-            self.shown = _last_shown[self._session.runner] = replace(self.shown, **parts)
+            shown = replace(self.shown, **parts).with_scalars(self._session.result)
+            self.shown = _last_shown[self._session.runner] = shown
 
     def change_picture(self, token: str, change: Mapping[str, Any]) -> None:
         """Change how the picture of a token is shown; ValueError or UnknownName if it can't be shown so."""
@@ -192,7 +206,7 @@ class Screen:
         found = stages(run, self.stages, self._asked)
         with self._lock:
             is_new, self.stages = found != self.stages, found
-            self.shown = self.shown.within(found, run)
+            self.shown = self.shown.within(found, run).with_scalars(run)
         if is_new:
             self.send_setup()
 
@@ -274,6 +288,7 @@ class Screen:
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
+            "scalars": shown.has_scalars,
             "pictures": {token: each.content for token, each in shown.pictures.items()},
             "closed": self._is_closed,
         }

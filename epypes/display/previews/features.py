@@ -220,7 +220,7 @@ def circle_sketch(array: Any, look: Look) -> Sketch | None:
 _FLOW_PX: Final = 60_000
 _LANDS: Final = 0.9
 _SMOOTH: Final = 0.25
-_MOST_ARROWS_ALONG: Final = 40
+_MOST_ARROWS_ALONG: Final = 32
 # An arrow may be so many times as long as from one to the next; it has a head of a third of its length.
 _REACH: Final = 1.5
 _LEAST_REACH: Final = 0.1

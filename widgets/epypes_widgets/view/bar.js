@@ -41,6 +41,7 @@ export function barPart(panel, { stage, compare, pictures, histogram, probe, roi
   const log = toggling("log", "Logarithmic counts (l)", "l", () => histogram.isLogarithmic, () => histogram.toggleLog());
   const hidden = "epypes-without-marks";
   const marks = toggling("marks", "Marks on the picture (o)", "o", () => !stage.box.classList.contains(hidden), () => stage.box.classList.toggle(hidden));
+  const numbers = toggling("numbers", "Numbers of the picture on it (n)", "n", () => pictures.hasNumbers, () => pictures.toggleNumbers(), "epypes-numbers-button");
   const probed = toggling("probe", "Values of the pixel under the pointer (p: by keys)", "", () => probe.isOn, () => probe.toggle());
   const draw = toggling("roi", "Draw a rectangle (r)", "r", () => roi.isDrawing, () => roi.toggle(), "epypes-roi-button");
   const root = element(
@@ -51,7 +52,7 @@ export function barPart(panel, { stage, compare, pictures, histogram, probe, roi
     group("History", undo, redo, reset),
     group("Zoom", iconButton("minus", "Zoom out (-)", stage.zoomOut), scale, iconButton("plus", "Zoom in (+)", stage.zoomIn), iconButton("fit", "Fit (0)", stage.fit, "epypes-fit")),
     group("Compare", select, flip, wipe, side),
-    group("Look", look, bars, log, marks, probed, draw),
+    group("Look", look, bars, log, marks, numbers, probed, draw),
   );
   let isLive = true;
   let isClosed = false;

@@ -124,8 +124,8 @@ export function histogramPart(panel) {
     chart.bars.replaceChildren(
       ...channels.map(({ name, counts }) => shape("path", { class: `epypes-channel epypes-channel-${name}`, d: outline(counts, most, isLogarithmic) })),
     );
-    say(chart.low, labels ? "largest" : shortly(low));
-    say(chart.high, labels ? "smallest" : shortly(high));
+    say(chart.low, labels ? "" : shortly(low));
+    say(chart.high, labels ? "" : shortly(high));
     const names = channels.length > 1 ? ` ${channels.map((one) => one.name).join(" ")}` : "";
     const about = labels ? `: ${labels}` : `${names}${sampled ? ", sampled" : ""}`;
     say(chart.title, `${token}${about}${isLogarithmic ? ", log counts" : ""}`);

@@ -14,7 +14,7 @@ const COLOUR_MAPS = {
 };
 /** Over another image what is black is clear; a mask is yellow, labels keep their colours. */
 const CLEAR_GROUNDS = { mask: "0 0 0 0 1  0 0 0 0 0.88  0 0 0 0 0.29  1 0 0 0 0", labels: "1 0 0 0 0  0 1 0 0 0  0 0 1 0 0  3 3 3 0 0" };
-const ZOOMS = { auto: "pixels from 300 %", nearest: "nearest: pixels", smooth: "smooth" };
+const ZOOMS = ["auto", "nearest", "smooth"];
 const AT_FIRST = { colour_map: "gray", over: "", opacity: 0.6, zoom: "auto" };
 const MOST_STEPS = 1000;
 const MOST_WHOLE_STEPS = 4096;
@@ -48,6 +48,7 @@ export function picturesPart(panel, stage) {
   const dressed = new Map();
   let main = null;
   let isOn = false;
+  let hasNumbers = false;
   let last = 0;
   const asked = questions((question, id) => {
     last = id;
@@ -83,7 +84,7 @@ export function picturesPart(panel, stage) {
   }
 
   function offer(node, options) {
-    node.replaceChildren(...Object.entries(options).map(([value, text]) => element("option", "", { value }, text)));
+    node.replaceChildren(...options.map((value) => element("option", "", { value }, value || "nothing")));
   }
 
   const ends = ["black", "white"].map((name, index) => {
@@ -104,13 +105,15 @@ export function picturesPart(panel, stage) {
     asking("Auto", "auto", "From the darkest to the brightest value of this picture, but for 0.35 % at each end"),
     asking("Reset", null, "The whole range again"),
   );
-  const colours = choice("colour_map", "Colour map", Object.fromEntries(Object.keys(COLOUR_MAPS).map((name) => [name, name])));
-  const over = choice("over", "The image of the same size under this one", {});
+  const colours = choice("colour_map", "Colour map", Object.keys(COLOUR_MAPS));
+  const over = choice("over", "The image of the same size under this one", []);
   const opacity = element("input", "epypes-opacity", { type: "range", min: 0, max: 1, step: 0.05, "aria-label": "Opacity" });
   opacity.addEventListener("input", () => keepSet({ opacity: Number(opacity.value) }));
   opacity.addEventListener("change", () => set({ opacity: Number(opacity.value) }));
-  const zoom = choice("zoom", "How the picture is enlarged", ZOOMS);
+  const zoom = choice("zoom", "How the picture is enlarged: pixels as squares (nearest), smooth, or squares from 300 % on (auto)", ZOOMS);
   const [coloured, lying, opaque] = [labelled("colours", colours), labelled("over", over), labelled("opacity", opacity)];
+  const numbers = element("dl", "epypes-numbers", { hidden: "", "aria-label": "Numbers of this picture" });
+  stage.pane.append(numbers);
   const root = element("div", "epypes-look", { role: "group", "aria-label": "View", hidden: "" }, contrast, coloured, lying, opaque, labelled("zoom", zoom), filters);
 
   function keepSet(change) {
@@ -143,7 +146,7 @@ export function picturesPart(panel, stage) {
     const tokens = ["", ...(main.beneath ?? [])];
     if (over.dataset.tokens !== tokens.join("\n")) {
       over.dataset.tokens = tokens.join("\n");
-      offer(over, Object.fromEntries(tokens.map((token) => [token, token || "nothing"])));
+      offer(over, tokens);
     }
     [colours.value, over.value, zoom.value, opacity.value] = [given.colour_map, given.over, given.zoom, given.opacity];
     const { low, high, step } = sliderOf(main);
@@ -173,10 +176,15 @@ export function picturesPart(panel, stage) {
     dress,
     setup(message) {
       settings = new Map(Object.entries(message.pictures ?? {}));
+      hasNumbers = Boolean(message.scalars);
       for (const [img, given] of dressed) dress(img, ...given);
       refresh();
+      panel.refresh();
     },
-    frame({ main: picture }) {
+    frame({ frame, main: picture }) {
+      const each = hasNumbers ? (frame.scalars ?? []) : [];
+      numbers.hidden = each.length === 0;
+      numbers.replaceChildren(...each.map(({ token, text }) => element("div", "", {}, element("dt", "", {}, token), element("dd", "", {}, text))));
       asked.answer(last);
       main = picture.image ? picture : null;
       refresh();
@@ -185,6 +193,12 @@ export function picturesPart(panel, stage) {
       isOn = !isOn;
       root.hidden = !isOn;
     },
+    toggleNumbers() {
+      hasNumbers = !hasNumbers;
+      if (!hasNumbers) numbers.hidden = true;
+      panel.send({ kind: "scalars", on: hasNumbers });
+    },
     get isOn() { return isOn; },
+    get hasNumbers() { return hasNumbers; },
   };
 }
