@@ -287,6 +287,8 @@ const answers = {
   },
 };
 
+kernel.answers = answers;
+
 const model = {
   send(content) {
     kernel.sent.push(structuredClone(content));
