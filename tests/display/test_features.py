@@ -11,7 +11,7 @@ import pytest
 from skimage import measure, registration
 
 import epypes as ep
-from epypes.display import Most, Scene, scene_of, view
+from epypes.display import Most, Scene, scalar_owners, scene_of, view
 from tests.display.test_backdrops import green, previews, run_of
 
 HEIGHT, WIDTH = 240, 320
@@ -295,3 +295,49 @@ def test_flow_without_two_images_is_not_drawn() -> None:
     flow = farneback(texture(), np.roll(texture(), 3, axis=1))
     assert flow_scene(lambda before, now: flow) is not None
     assert scene(lambda image: flow) is None
+
+
+# -- numbers --------------------------------------------------------------------------------------------------
+
+
+def test_the_numbers_that_were_made_from_an_image_stand_with_it() -> None:
+    functions = {
+        "blur": lambda image: cv2.blur(image, (3, 3)),
+        "above": lambda blurred, level: blurred > level,
+        "area": lambda mask: int(mask.sum()),
+        "name": lambda mask: "large" if mask.sum() > 50 else "small",
+        "mean": lambda image: np.float32(image.mean()),
+        "share": lambda n, image: n / image.size,
+        "double": lambda level: 2 * level,
+    }
+    io = {
+        "blur": ("image", "blurred"),
+        "above": (("blurred", "level"), "mask"),
+        "area": ("mask", "n"),
+        "name": ("mask", "size"),
+        "mean": ("image", "mean"),
+        "share": (("n", "image"), "share"),
+        "double": ("level", "twice"),
+    }
+    runner = ep.CompGraphRunner(ep.CompGraph(functions, io), {"level": 120})
+    run = runner.run(image=disks())
+    assert scalar_owners(run) == {"n": "mask", "size": "mask", "mean": "image", "share": "image"}
+    shown = previews(run)
+    assert shown["mask"].detail.endswith(f"mask, n = {run['n']}, size = 'large'")
+    assert f", mean = {run['mean']:.6g}, share = " in shown["image"].detail
+    assert " = " not in shown["blurred"].detail
+
+
+def test_a_number_that_is_out_of_date_does_not_stand_with_its_image() -> None:
+    cg = ep.CompGraph.from_functions(_above, _n)
+    runner = ep.CompGraphRunner(cg, {"level": 120})
+    assert ", _n = " in previews(runner.run(image=disks()))["_above"].detail
+    assert ", _n = " not in previews(runner.rerun("_above", level=130))["_above"].detail
+
+
+def _above(image: Any, level: int) -> Any:
+    return image > level
+
+
+def _n(_above: Any) -> int:
+    return int(_above.sum())

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
-from epypes.display import Scene, is_image, scene_of
+from epypes.display import Scene, is_image, scalar_owners, scene_of
 from epypes.display.previews.arrays import is_strip, plain_array
 from epypes.display.previews.images import image_kind, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
 from epypes.graph import colour_order
 from epypes.images import Order
-from epypes.optional import LazyModule
 from epypes.run import Run
 from epypes.run.guard import ARRAYLESS
 
 if TYPE_CHECKING:
-    import numpy as np
     import numpy.typing as npt
 
     Array = npt.NDArray[Any]
-else:
-    np = LazyModule("numpy")
 
 _CHANNELS: Final = {"bgr": "BGRA", "rgb": "RGBA"}
 
@@ -119,41 +114,12 @@ def _value(run: Run, token: str) -> Any:
 
 # -- numbers of a picture ---------------------------------------------------------------------------------------------
 
-_TEXT_CHARACTERS: Final = 40
-
 
 def scalars(run: Run, token: str) -> tuple[str, ...]:
-    """Return the numbers and short texts that belong to a picture, in graph order, up to date or not.
-
-    A value belongs to the image that is the nearest of those that it was made from: to a stage that is this image, or
-    that is drawn over it.
-    """
-    scene = scene_of(run, token, had_marks=True)
+    """Return the numbers and short texts that belong to a picture: to the stage, or to what it is drawn over."""
+    scene, owners = scene_of(run, token, had_marks=True), scalar_owners(run)
     images = {token, scene.backdrop.name} if scene is not None else {token}
-    made = run.cg.digraph.producer
-    named = (name for name in run.cg.tokens if name in made and _is_scalar(_value(run, name)))
-    return tuple(name for name in named if _nearest_image(run, name) in images)
-
-
-def _is_scalar(value: Any) -> bool:
-    kind = type(value)
-    return (
-        kind in (bool, int, float) or isinstance(value, np.generic) or (kind is str and len(value) <= _TEXT_CHARACTERS)
-    )
-
-
-def _nearest_image(run: Run, token: str) -> str:
-    """Return the nearest image that a token was made from; empty if there is none."""
-    graph, waiting, seen = run.cg.digraph, deque([token]), {token}
-    while waiting:
-        maker = graph.producer.get(waiting.popleft())
-        for name in graph.inputs[maker] if maker is not None else ():
-            if name not in seen:
-                if is_image(_value(run, name)):
-                    return name
-                seen.add(name)
-                waiting.append(name)
-    return ""
+    return tuple(name for name, image in owners.items() if image in images)
 
 
 # -- at a pixel -------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
+from operator import itemgetter
 from types import CodeType
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
@@ -20,7 +21,7 @@ from epypes.display.previews import Backdrop, Look, Most, Scene, Surroundings
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.features import are_keypoints, no_marks
 from epypes.display.previews.images import Range, display_range, image_kind, is_image, own_range, sampled
-from epypes.display.previews.introspection import kind_name
+from epypes.display.previews.introspection import is_of, kind_name
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
 from epypes.graph.identity import innermost
@@ -192,6 +193,37 @@ class RunSurroundings(Surroundings):
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
         return Backdrop(value, colour_order(self._run.cg, token), self.range_of(value, token), token)
+
+
+_SCALAR_CHARACTERS: Final = 40
+
+
+def scalar_owners(run: Run) -> dict[str, str]:
+    """Return the image that each number or short text of a run belongs to, by token, in graph order.
+
+    It belongs to the nearest of the images that it was made from; one that was made from none is left out. Values that
+    are out of date count, too.
+    """
+    graph, values = run.cg.digraph, dict(zip(run.tokens.program.tokens, run.tokens.values, strict=True))
+    scalars = [name for name in run.cg.tokens if name in graph.producer and _is_scalar(values[name])]
+    if not scalars:
+        return {}
+    images = {name for name, value in values.items() if is_image(value)}
+    # By token the image, and how many functions lie between.
+    nearest = {name: (0, name) for name in images}
+    for function in run.cg.functions:
+        found = [nearest[name] for name in graph.inputs[function] if name in nearest]
+        if found:
+            distance, image = min(found, key=itemgetter(0))
+            for name in graph.outputs[function]:
+                nearest.setdefault(name, (distance + 1, image))
+    return {name: nearest[name][1] for name in scalars if name in nearest}
+
+
+def _is_scalar(value: Any) -> bool:
+    kind = type(value)
+    is_text = kind is str and len(value) <= _SCALAR_CHARACTERS
+    return kind in (bool, int, float) or is_text or is_of(value, "numpy", "generic")
 
 
 def _names_in(code: object) -> frozenset[str]:
