@@ -102,6 +102,7 @@ RNG = np.random.default_rng(0)
         np.float32([[[50, 60, -20]]]),  # no radius
         np.float32([[[50, 60, 900]]]),  # larger than the image
         np.float32([[[500, 60, 20]]]),  # not on the image
+        np.float32([[[50, 60, 20], [70, 80, 20], [900, 60, 20]]]),  # not all on the image
         np.float32([[[50, 60, np.nan]]]),
         RNG.uniform(0, 200, (5, 3)).astype(np.float32),  # colours of k-means, a cloud of points
         RNG.uniform(0, 200, (5, 3)),  # row, column and scale of blobs
@@ -111,6 +112,11 @@ RNG = np.random.default_rng(0)
 )
 def test_what_only_has_the_shape_of_circles_is_not_drawn(value: Any) -> None:
     assert drawn(lambda image: value) == ""
+    assert "circles" not in previews(run_of(found=lambda image: value))["found"].detail
+
+
+def test_bytes_are_colours_whatever_they_are_called() -> None:
+    assert drawn(lambda image: RNG.integers(0, 200, (1, 20, 3), np.uint8), "circle_colours") == ""
 
 
 # -- boxes ----------------------------------------------------------------------------------------------------
@@ -172,7 +178,7 @@ def test_four_whole_numbers_without_a_name_are_no_boxes(value: Any) -> None:
     "value",
     [
         [(50, 40, 60, 0)],
-        [(-5, 40, 60, 60)],
+        [(-5, 40, 60, 30)],
         [(300, 40, 60, 60)],
         [(10.5, 40.0, 5.0, 6.0)],
         [(50, 40, 60, 60), (1, 2, 3)],

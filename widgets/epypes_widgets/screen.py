@@ -159,8 +159,8 @@ class Screen:
     ) -> None:
         self.view = view
         before = _last_shown.get(session.runner, Shown())
-        self.shown = Shown(asked or before.token, before.pinned, None, bool(cut), cut, before.pictures)
-        self.shown = replace(self.shown, has_scalars=before.has_scalars)
+        first = replace(before, token=asked or before.token, comparison=None, has_histogram=bool(cut), cut=cut)
+        self.shown = first.with_scalars(session.result)
         self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
