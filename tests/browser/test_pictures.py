@@ -198,7 +198,7 @@ def test_numbers_stand_on_the_picture_while_they_are_wanted(view: ViewPage) -> N
     view.until("document.querySelector('.epypes-numbers').innerText.includes('1843')")
     assert view.sent("scalars") == [{"kind": "scalars", "on": True}]
     box, at = view.box(".epypes-box"), view.box(".epypes-numbers")
-    assert (box["x"] < at["x"], box["y"] < at["y"]) == (True, True)
+    assert (box["x"] < at["x"], box["y"] < at["y"], at["width"] < box["width"] / 2) == (True, True, True)
     view.focus()
     view.press("n")
     assert not view.shown(".epypes-numbers")

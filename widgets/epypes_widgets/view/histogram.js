@@ -124,8 +124,7 @@ export function histogramPart(panel) {
     chart.bars.replaceChildren(
       ...channels.map(({ name, counts }) => shape("path", { class: `epypes-channel epypes-channel-${name}`, d: outline(counts, most, isLogarithmic) })),
     );
-    say(chart.low, labels ? "" : shortly(low));
-    say(chart.high, labels ? "" : shortly(high));
+    for (const [node, end] of [[chart.low, low], [chart.high, high]]) say(node, labels ? "" : shortly(Number(end.toPrecision(6))));
     const names = channels.length > 1 ? ` ${channels.map((one) => one.name).join(" ")}` : "";
     const about = labels ? `: ${labels}` : `${names}${sampled ? ", sampled" : ""}`;
     say(chart.title, `${token}${about}${isLogarithmic ? ", log counts" : ""}`);

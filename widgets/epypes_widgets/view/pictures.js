@@ -37,6 +37,9 @@ export function sliderOf({ range, limits, dtype }) {
   return { low, high, step: isWhole ? 1 : (high - low) / MOST_STEPS };
 }
 
+/** Return a limit as the box shows it: whole, or as many digits as fit. */
+const limitText = (value) => written(Number.isInteger(value) ? value : Number(value.toPrecision(5)));
+
 let views = 0;
 
 /** Controls in a row above the picture. */
@@ -94,7 +97,7 @@ export function picturesPart(panel, stage) {
     box.addEventListener("change", () => {
       const value = Number(box.value);
       if (box.value.trim() && Number.isFinite(value)) limit(index, value);
-      box.value = written(main.limits[index]);
+      box.value = limitText(main.limits[index]);
     });
     for (const node of [slider, box]) node.addEventListener("blur", refresh);
     return { slider, box, label: labelled(name, slider, box) };
@@ -112,7 +115,7 @@ export function picturesPart(panel, stage) {
   opacity.addEventListener("change", () => set({ opacity: Number(opacity.value) }));
   const zoom = choice("zoom", "How the picture is enlarged: pixels as squares (nearest), smooth, or squares from 300 % on (auto)", ZOOMS);
   const [coloured, lying, opaque] = [labelled("colours", colours), labelled("over", over), labelled("opacity", opacity)];
-  const numbers = element("dl", "epypes-numbers", { hidden: "", "aria-label": "Numbers of this picture" });
+  const numbers = element("div", "epypes-numbers", { hidden: "", role: "group", "aria-label": "Numbers of this picture" });
   stage.pane.append(numbers);
   const root = element("div", "epypes-look", { role: "group", "aria-label": "View", hidden: "" }, contrast, coloured, lying, opaque, labelled("zoom", zoom), filters);
 
@@ -154,7 +157,7 @@ export function picturesPart(panel, stage) {
       for (const [name, value] of Object.entries({ min: low, max: high, step })) note(slider, name, value);
       // What the user holds is the user's.
       if (document.activeElement !== slider) slider.value = main.limits[index];
-      if (document.activeElement !== box) box.value = written(Number(main.limits[index].toPrecision(6)));
+      if (document.activeElement !== box) box.value = limitText(main.limits[index]);
       note(slider, "title", shortly(main.limits[index]));
     });
     note(stage.box, "data-zoom", given.zoom);
@@ -184,7 +187,7 @@ export function picturesPart(panel, stage) {
     frame({ frame, main: picture }) {
       const each = hasNumbers ? (frame.scalars ?? []) : [];
       numbers.hidden = each.length === 0;
-      numbers.replaceChildren(...each.map(({ token, text }) => element("div", "", {}, element("dt", "", {}, token), element("dd", "", {}, text))));
+      numbers.replaceChildren(...each.flatMap(({ token, text }) => [element("span", "", {}, token), element("b", "", {}, text)]));
       asked.answer(last);
       main = picture.image ? picture : null;
       refresh();
