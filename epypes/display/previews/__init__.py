@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
@@ -48,6 +49,11 @@ class Picture:
     width: int
     height: int
     kind: ImageKind = "photograph"
+
+    @property
+    def uri(self) -> str:
+        """The address that contains the file."""
+        return f"data:{self.media_type};base64,{base64.b64encode(self.data).decode()}"
 
 
 @dataclass(frozen=True, slots=True)
