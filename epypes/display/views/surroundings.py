@@ -223,7 +223,8 @@ def scalar_owners(run: Run) -> dict[str, str]:
 def _is_scalar(value: Any) -> bool:
     kind = type(value)
     is_text = kind is str and len(value) <= _SCALAR_CHARACTERS
-    return kind in (bool, int, float) or is_text or is_of(value, "numpy", "generic")
+    # Most values are arrays, which are known at a glance.
+    return kind in (bool, int, float) or is_text or (kind.__name__ != "ndarray" and is_of(value, "numpy", "generic"))
 
 
 def _names_in(code: object) -> frozenset[str]:
