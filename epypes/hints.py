@@ -208,6 +208,8 @@ def odd_step(step: float | None) -> int:
 def as_param(hint: Any) -> Param | Roi | None:
     """Read a hint: a Param or Roi, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
 
+    A dict has choices by their labels.
+
     Examples
     --------
     >>> as_param((0, 255))
@@ -221,6 +223,8 @@ def as_param(hint: Any) -> Param | Roi | None:
         return Param(*hint)
     if isinstance(hint, list):
         return Param(choices=tuple(hint))
+    if isinstance(hint, dict):
+        return Param(choices=tuple(hint.values()), labels=tuple(map(str, hint)))
     return None
 
 

@@ -226,7 +226,7 @@ def cases_of(given: Any, *, are_series: bool = False) -> tuple[Case, ...]:
         given = [given]
     if is_path and not isinstance(given, list):
         found = _read_file(Path(given), are_series)
-    elif isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
+    elif isinstance(given, Case | Mapping | bytes | bytearray) or not isinstance(given, Iterable):
         raise ScaleError(
             f"cases is a list of cases or the path of a file of them, not a single {type(given).__name__!r}."
         )
@@ -262,7 +262,7 @@ def case_items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]
     Raises
     ------
     ScaleError
-        An item does not give the free source tokens.
+        An item does not give the free source tokens, or a sequence is empty.
     """
     if not runner.state:
         items = items_of([case.inputs for case in cases], runner)
@@ -275,7 +275,11 @@ def case_items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]
             yield Item(number, name, {}, frames=os.path.abspath(Path(given).expanduser()))
         else:
             is_payload = is_one_image(given) or isinstance(given, Mapping)
-            yield Item(number, name, {}, frames=tuple(items_of([given] if is_payload else given, runner)))
+            try:
+                frames = tuple(items_of([given] if is_payload else given, runner))
+            except ScaleError as error:
+                raise ScaleError(f"The inputs of {case}: {error}") from error
+            yield Item(number, name, {}, frames=frames)
 
 
 def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:

@@ -1,4 +1,4 @@
-"""The contact sheet of a sweep: the outcomes laid out by their settings, and how that looks on a page.
+"""The contact sheet of a sweep or a map: the outcomes laid out by their settings, and how that looks on a page.
 
 Rows and columns are the values of two hyperparameters; what else varies, a third one or the image, gives further
 blocks. Settings that fill no such table, as random ones, stand one after another. The page is a table whose cells hold
@@ -18,10 +18,14 @@ from typing import Final
 from epypes.batch.grid import identity
 from epypes.batch.results import Outcome, ShownAsPage, short_text
 from epypes.batch.thumbnails import Thumbnail, picture_element, smaller
+from epypes.display.previews.short import float_text
 from epypes.display.text import CHARACTERS, THUMBNAIL_CHARACTERS, content, fitted, size
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.wording import counted
+
+# Of a float below a picture.
+_DIGITS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +44,8 @@ class Tile:
         Whether the setting failed.
     thumbnail
         None if there is none.
+    numbers
+        What stands below the picture, line by line: sink tokens that are numbers or truth values, as ``"n_coins 24"``.
     """
 
     place: int
@@ -47,6 +53,7 @@ class Tile:
     text: str
     has_failed: bool
     thumbnail: Thumbnail | None
+    numbers: tuple[str, ...] = ()
 
 
 Cell = tuple[Tile, ...]
@@ -62,7 +69,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Sheet(ShownAsPage):
-    """The outcomes of a sweep as pictures side by side; shows itself.
+    """The outcomes of a sweep or a map as pictures side by side; shows itself.
 
     Attributes
     ----------
@@ -119,12 +126,12 @@ def sheet_of(
     rows: str | None = None,
     columns: str | None = None,
 ) -> Sheet:
-    """Lay out the outcomes of a sweep.
+    """Lay out the outcomes of a sweep, or of a map, which have no settings.
 
     Parameters
     ----------
     cg
-        The graph that was swept.
+        The graph that was run.
     outcomes
         In the order of the grid.
     token
@@ -154,18 +161,24 @@ def sheet_of(
 
     grouped: dict[tuple[Hashable, ...], list[int]] = {}
     for place, outcome in enumerate(outcomes):
-        grouped.setdefault((outcome.number, *(keys[place][name] for name in by_block)), []).append(place)
+        number = outcome.number if axes else None
+        grouped.setdefault((number, *(keys[place][name] for name in by_block)), []).append(place)
+    if not axes:
+        grouped = {
+            key: sorted(places, key=lambda place: not outcomes[place].has_failed) for key, places in grouped.items()
+        }
     blocks = []
     for places in grouped.values():
         cells: dict[tuple[Hashable, ...], list[Tile]] = {}
         for place in places:
             at = (keys[place].get(rows or ""), keys[place].get(columns or "")) if is_table else (None, place)
-            cells.setdefault(at, []).append(_tile(place, outcomes[place], ", ".join(labels(place, by_tile)), shown))
+            label = ", ".join(labels(place, by_tile)) if axes else outcomes[place].name
+            cells.setdefault(at, []).append(_tile(place, outcomes[place], label, shown))
         across: Iterable[Hashable] = axes.get(columns or "", [None]) if is_table else places
         table = tuple(
             tuple(tuple(cells.get((row, column), ())) for column in across) for row in axes.get(rows or "", [None])
         )
-        title = [outcomes[places[0]].name] * has_images + labels(places[0], by_block)
+        title = [outcomes[places[0]].name] * (has_images and bool(axes)) + labels(places[0], by_block)
         blocks.append(Block(", ".join(title), table))
     row_labels, column_labels = (tuple(axes[name].values()) if name else () for name in (rows, columns))
     return Sheet(shown, rows, columns, row_labels, column_labels, tuple(blocks))
@@ -201,9 +214,14 @@ def _tile(place: int, outcome: Outcome, label: str, shown: str | None) -> Tile:
     thumbnail = None if shown is None else outcome.thumbnails.get(shown)
     if outcome.error_info is not None:
         return Tile(place, label, str(outcome.error_info), True, thumbnail)
+    numbers = tuple(
+        f"{token} {float_text(value, _DIGITS) if isinstance(value, float) else value}"
+        for token, value in outcome.values.items()
+        if token != shown and type(value) in (bool, int, float)
+    )
     if thumbnail is not None:
-        text = thumbnail.caption
-    elif shown is not None and shown in outcome.texts:
+        return Tile(place, label, thumbnail.caption, False, thumbnail, numbers)
+    if shown is not None and shown in outcome.texts:
         text = outcome.texts[shown]
     elif shown is not None and shown in outcome.values:
         text = short_text(outcome.values[shown])
@@ -279,8 +297,8 @@ def _page(sheet: Sheet, shown: Sheet, chosen: int | None) -> str:
     parts += [_paint_block(shown, block, most_bytes, chosen) for block in shown.blocks]
     if len(tiles) < total:
         parts.append(
-            f"<p>and {total - len(tiles):,} more, for which there is no room here: to_frame() lists all, "
-            "sheet(rows=..., columns=...) lays them out otherwise, pick(result) of epypes_widgets shows more.</p>"
+            f"<p>and {total - len(tiles):,} more, for which there is no room here: to_frame() lists all; of a sweep, "
+            "sheet(rows=..., columns=...) lays them out otherwise, and pick(result) of epypes_widgets shows more.</p>"
         )
     side_px = _SIDE_PX if pictures <= _MANY else _SMALL_PX
     # Tiles without pictures are no higher than their texts.
@@ -325,5 +343,6 @@ def _paint_cell(tag: str, tiles: Cell, most_bytes: int, chosen: int | None) -> s
             mark = "<b>failed</b> " * tile.has_failed
             painted += f"{label}<span>{mark}{content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
         else:
-            painted += f"{picture_element(picture, tile.text, _LABEL_ROOM)}{label}"
+            numbers = "".join(f"<span>{content(fitted(number, _LABEL_ROOM))}</span>" for number in tile.numbers)
+            painted += f"{picture_element(picture, tile.text, _LABEL_ROOM)}{label}{numbers}"
     return f'<{tag} class="cell{state}">{painted}</{tag}>'

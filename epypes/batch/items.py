@@ -166,6 +166,11 @@ def image_set(images: Any) -> ImageSet:
         return _held_set(*_files(images))
     if isinstance(images, Video):
         return _held_set([images])
+    if isinstance(images, bytes | bytearray | memoryview):
+        raise ScaleError(
+            "images is bytes, as the content of a file is. Give the path of the file, or decode them to a list of "
+            "images: [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)]."
+        )
     if isinstance(images, Mapping):
         raise ScaleError("images is one dict. Give a list of dicts by token: [{...}, {...}].")
     if _is_image(images):
@@ -334,6 +339,8 @@ def with_series(items: Iterator[Item], series: SeriesKeys | None) -> Iterator[It
     ------
     ScaleError
         There is no key for an item, or none that can be told from others.
+    Exception
+        What the function raises, with a note that names the item.
     """
     if series is None:
         return items
@@ -349,7 +356,14 @@ def _keyed(items: Iterator[Item], series: SeriesKeys) -> Iterator[Item]:
     keys, count = iter(()) if callable(series) else iter(series), 0
     for item in items:
         if callable(series):
-            key = series(next(iter(item.payload.values())) if len(item.payload) == 1 else dict(item.payload))
+            given = next(iter(item.payload.values())) if len(item.payload) == 1 else dict(item.payload)
+            try:
+                key = series(given)
+            except Exception as error:
+                text = f"In series=, which was called with a {type(given).__name__!r}, the input of item {item.name}."
+                error.add_note(f"{text} It gets the Path of a file, else the value itself.")
+                raise
+            del given
         else:
             key = next(keys, _ABSENT_KEY)
         if key is _ABSENT_KEY:

@@ -58,6 +58,24 @@ class MapResult(BatchResult[Outcome]):
         """
         return outcomes_frame(self.outcomes, self.cg)
 
+    def sheet(self, token: str | None = None) -> Sheet:
+        """Return the contact sheet of a token: the images side by side with their numbers, those that failed first.
+
+        Parameters
+        ----------
+        token
+            One of those that ``show`` named. None: the last sink token that has pictures, else the last token that has
+            some.
+
+        Raises
+        ------
+        UnknownName
+            There is no such token.
+        ScaleError
+            Nothing of the token was kept to be shown.
+        """
+        return sheet_of(self.cg, self.outcomes, token)
+
     @property
     def _caption(self) -> str:
         return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
@@ -156,7 +174,8 @@ def map_images(
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.
     show
-        Tokens of which thumbnails are kept, which the table shows; None: all that have a picture.
+        Tokens of which thumbnails are kept, which the table and ``result.sheet(token)`` show; None: all that have a
+        picture.
     series
         How the images are divided into series: a key per image, or a function that is called with an image and returns
         its key (of a file with its Path, of several free source tokens with a dict):

@@ -9,6 +9,7 @@ database itself took 179 ms per trial.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import threading
 import warnings
@@ -28,7 +29,7 @@ from epypes.batch.items import detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.mapping import tokens_of
 from epypes.batch.results import BatchResult, Outcome, failure_column, frame_of, html_table, value_text
-from epypes.batch.thumbnails import picture_element, thumbnail_of_value
+from epypes.display.paint.page import paint_page
 from epypes.display.text import content, cut, cut_name
 from epypes.errors import ScaleError
 from epypes.graph import subgraph
@@ -41,9 +42,8 @@ from epypes.wording import counted, ended, error_message
 if TYPE_CHECKING:
     import optuna
     import pandas as pd
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
+    from epypes.display.paint.plot import Plot
     from epypes.store import Store
 
 # Of the values that are held between settings; further cases run from their files or arrays each time.
@@ -58,8 +58,8 @@ _NANOSECONDS: Final = "total_ns"
 _ABOUT: Final = "about"
 # On the page.
 _MOST_REASONS: Final = 3
-_TEXT_ROOM: Final = 200
-_CURVE_PX: Final = 256
+_PLOT_SIZE: Final = (6.4, 2.8)
+_MOST_DOTS: Final = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,31 +183,46 @@ class OptimizeResult(BatchResult[Trial]):
             ("ms", [trial.total_ns / 1e6 for trial in trials], ""),
         ])  # fmt: skip
 
-    def history_plot(self) -> Figure:
-        """Draw the value of each trial that completed, and the best one so far, as Optuna does with Matplotlib."""
-        from optuna.visualization.matplotlib import plot_optimization_history
+    def history_plot(self) -> Plot:
+        """Draw the value of each trial that completed, and the best one so far."""
+        with optional_import("scale"):
+            from matplotlib import style
+            from matplotlib.ticker import MaxNLocator
 
-        return self._figure(lambda: plot_optimization_history(self.study, target_name=self.metric))
+            from epypes.display.paint.plot import BLUE, PLOT_STYLE, RED, plot
 
-    def importance_plot(self) -> Figure:
-        """Draw how much each hyperparameter matters, as Optuna does with Matplotlib."""
-        from optuna.importance import PedAnovaImportanceEvaluator
-        from optuna.visualization.matplotlib import plot_param_importances
+        best, choose = self.best_trial, max if self.direction == "maximize" else min
+        completed = [trial for trial in self.trials if trial.value is not None]
+        numbers, values = [trial.number for trial in completed], list(map(_value, completed))
+        with style.context(PLOT_STYLE):
+            figure, axes = plot(width=_PLOT_SIZE[0], height=_PLOT_SIZE[1])
+            dots = axes.scatter(numbers, values, s=14, color=BLUE, alpha=0.75, linewidths=0, label="a trial")
+            dots.set_rasterized(len(completed) > _MOST_DOTS)  # a picture of thousands is smaller
+            so_far = list(itertools.accumulate(values, choose))
+            axes.plot(numbers, so_far, color=RED, linewidth=1.6, drawstyle="steps-post", label="the best so far")
+            text = f"{cut_name(self.metric, 30)} by trial: from {values[0]:.6g} to {best.value:.6g}"
+            axes.set_title(text, loc="left", fontsize=9)
+            axes.set_xlabel("trial")
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            figure.legend(loc="outside lower left", ncols=2, fontsize=9)
+        return figure
 
-        # The default evaluator of older versions needs scikit-learn.
-        return self._figure(
-            lambda: plot_param_importances(self.study, PedAnovaImportanceEvaluator(), target_name=self.metric)
-        )
+    def importance_plot(self) -> Plot:
+        """Draw how much each hyperparameter matters, the most important at the top."""
+        with optional_import("scale"):
+            from matplotlib import style
 
-    def _figure(self, draw: Callable[[], Axes]) -> Figure:
-        """Return a figure that Optuna draws; it leaves no style set, and no figure open in pyplot."""
-        from matplotlib import pyplot
+            from epypes.display.paint.plot import BLUE, PLOT_STYLE, plot
 
         _ = self.best_trial  # without one there is nothing to draw
-        with pyplot.rc_context(), _quiet_optuna():
-            draw()
-            figure = pyplot.gcf()
-        pyplot.close(figure)
+        parts = dict(reversed(self.importances.items()))
+        with style.context(PLOT_STYLE):
+            figure, axes = plot(width=_PLOT_SIZE[0], height=1.0 + 0.3 * len(parts))
+            bars = axes.barh([cut_name(token, 30) for token in parts], list(parts.values()), color=BLUE)
+            axes.bar_label(bars, [f"{part:.0%}" for part in parts.values()], padding=4)
+            axes.set_title(f"how much each matters for {cut_name(self.metric, 30)}", loc="left", fontsize=9)
+            axes.xaxis.set_visible(False)
+            axes.spines.bottom.set_visible(False)
         return figure
 
     @property
@@ -222,27 +237,17 @@ class OptimizeResult(BatchResult[Trial]):
         return f"{counted(len(self.trials), 'trial')}{state}; {found}"
 
     def _page(self) -> str:
-        """Return the curve of the best value so far, the table of what was found, and why trials failed."""
+        """Return the plot of the trials, the table of what was found, and why trials failed."""
         best = best_of(self.trials, self.direction)
         parts = [f"<p>{content(self._caption)}</p>"]
         if best is not None:
-            parts += [self._curve(), self._table(best)]
+            parts += [self.history_plot().html(), self._table(best)]
         reasons = list(dict.fromkeys(trial.failure for trial in self.failures))
         if reasons:
             items = "".join(f"<li>{content(cut(reason, 200))}</li>" for reason in reasons[:_MOST_REASONS])
             more = f"<li>and {len(reasons) - _MOST_REASONS} more reasons</li>" if len(reasons) > _MOST_REASONS else ""
             parts.append(f"<details><summary>Why trials failed</summary><ul>{items}{more}</ul></details>")
-        return f"<div>{''.join(parts)}</div>"
-
-    def _curve(self) -> str:
-        """Return a picture of the best value so far, by trial that completed."""
-        import numpy as np
-
-        values = [trial.value for trial in self.trials if trial.value is not None]
-        so_far = np.maximum.accumulate(values) if self.direction == "maximize" else np.minimum.accumulate(values)
-        picture, metric = thumbnail_of_value(so_far), cut_name(self.metric, 30)
-        text = f"The best {metric} so far, by trial: from {so_far[0]:.6g} to {so_far[-1]:.6g}."
-        return "" if picture is None else picture_element(picture, text, _TEXT_ROOM, _CURVE_PX)
+        return paint_page(*parts)
 
     def _table(self, best: Trial) -> str:
         first, parts = self.trials[0], self.importances

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, overload
 
 from epypes.batch.items import Item
-from epypes.batch.thumbnails import Thumbnail, picture_element
+from epypes.batch.thumbnails import LEAST_BYTES, Thumbnail, picture_element, smaller
 from epypes.display.previews import Look
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import float_text, reason
@@ -21,6 +21,7 @@ from epypes.errors import ImageFileError, ScaleError
 from epypes.graph import CompGraph
 from epypes.nothing import Nothing
 from epypes.optional import optional_import
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -311,6 +312,10 @@ def _item_columns(outcomes: Sequence[Outcome]) -> dict[str, list[Any]]:
 
 _MOST_ROWS: Final = 100
 _ROOM_OF_PICTURES: Final = 80_000
+_ELEMENT_ROOM: Final = 110
+# More of them are smaller, all of one size.
+_MANY_PICTURES: Final = 24
+_SMALL_PX: Final = 80
 _CELL_ROOM: Final = 100
 _FAILURE_ROOM: Final = 300
 _LEFT: Final = ' style="text-align:left"'
@@ -327,7 +332,7 @@ def html_table(caption: str, columns: Iterable[HtmlColumn], failures: Sequence[s
     caption
         What stands above it.
     columns
-        Titles, and a cell per row; a picture is described by its column and the first cell of its row.
+        Titles, and a cell per row. The more pictures there are, the smaller they are.
     failures
         By row, what failed; empty texts where nothing did. These rows come first, and have one more column.
     """
@@ -337,14 +342,21 @@ def html_table(caption: str, columns: Iterable[HtmlColumn], failures: Sequence[s
     shown = sorted(range(len(rows)), key=lambda place: not reasons[place])[:_MOST_ROWS]
     head = [*titles, *(["failure"] if any(failures) else [])]
     lines = [f"<tr>{''.join(f'<th{_LEFT}>{content(title)}</th>' for title in head)}</tr>"]
-    room = _ROOM_OF_PICTURES
+    pictures = sum(isinstance(cell, Thumbnail) for place in shown for cell in rows[place])
+    room, hidden, side_px = _ROOM_OF_PICTURES, 0, None if pictures <= _MANY_PICTURES else _SMALL_PX
     for place in shown:
         painted = ""
         for title, cell in zip(titles, rows[place], strict=True):
             if isinstance(cell, Thumbnail):
-                element = picture_element(cell, f"{title} of {rows[place][0]}: {cell.caption}", _CELL_ROOM)
+                text = f"{title} of {rows[place][0]}: {cell.caption}"
+                # The description stands there twice.
+                most_bytes = (_ROOM_OF_PICTURES // pictures - _ELEMENT_ROOM - 2 * len(text)) * 3 // 4
+                element = picture_element(
+                    smaller(cell, max(most_bytes, LEAST_BYTES)) or cell, text, _CELL_ROOM, side_px
+                )
                 element = element if len(element) <= room else ""
                 room -= len(element)
+                hidden += not element
             else:
                 element = content(fitted(cell or "", _CELL_ROOM))
             painted += f"<td{_LEFT}>{element}</td>"
@@ -355,6 +367,7 @@ def html_table(caption: str, columns: Iterable[HtmlColumn], failures: Sequence[s
     above = f"<caption{_LEFT}>{content(fitted(caption, _FAILURE_ROOM))}</caption>" if caption else ""
     left_out = len(rows) - len(shown)
     more = f"<p>and {left_out} more: to_frame() has all of them</p>" if left_out else ""
+    more += f"<p>and {counted(hidden, 'picture')} more, for which there is no room here</p>" if hidden else ""
     return f"<table>{above}{''.join(lines)}</table>{more}"
 
 

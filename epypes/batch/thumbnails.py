@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import base64
 import io
+from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+# First, since an import of a module of display that Ctrl-C has ended could not be repeated otherwise.
+from epypes.display import is_image
 from epypes.display.paint.vertices import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews import THUMBNAIL_PX, Look, Sketch
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.encoding import encode_small
-from epypes.display.previews.images import image_kind, is_image, sampled, sole_value
+from epypes.display.previews.images import image_kind, sampled, sole_value
 from epypes.display.previews.preview import finished, looked_closer, sketch
 from epypes.display.previews.short import float_text
 from epypes.display.text import escape, fitted
@@ -25,6 +28,9 @@ from epypes.graph import CompGraph, colour_order
 from epypes.images import Order
 from epypes.optional import optional_import
 from epypes.run import Run
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 # A chart stands alone in its file, so it brings its colours: a grey that is seen on white and on black.
 _CHART_STYLE: Final = (
@@ -181,26 +187,48 @@ def _mask_difference(got: Any, wanted: Any) -> Thumbnail:
 # -- on a page --------------------------------------------------------------------------------------------------
 
 # What a smaller picture shows is hardly seen.
-_LEAST_BYTES: Final = 400
+LEAST_BYTES: Final = 300
+# The longer side in pixels, and the quality, of ever smaller files. A JPEG has 600 bytes before its first pixel.
+_WEBP: Final = ((128, 60), (128, 35), (96, 35), (80, 35), (80, 20), (64, 25), (64, 12), (48, 15), (40, 10), (32, 5))
 
 
-def picture_element(shown: Thumbnail, text: str, room: int, width_px: int | None = None) -> str:
-    """Return a thumbnail as an image element of a page, described by a text of at most so many characters."""
-    alt, width = escape(fitted(text, room)), "" if width_px is None else f' width="{width_px}"'
+def picture_element(shown: Thumbnail, text: str, room: int, side_px: int | None = None) -> str:
+    """Return a thumbnail as an image element of a page, described by a text of at most so many characters.
+
+    With a side it fills a square of that size, so that pictures of many sizes stand in a row.
+    """
+    alt = escape(fitted(text, room))
     address = f"data:{shown.media_type};base64,{base64.b64encode(shown.data).decode()}"
-    return f'<img src="{address}"{width} alt="{alt}" title="{alt}">'
+    style = "" if side_px is None else f' style="width:{side_px}px;height:{side_px}px;object-fit:contain"'
+    return f'<img src="{address}"{style} alt="{alt}" title="{alt}">'
 
 
 def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:
-    """Return a picture within so many bytes; None if nothing would be seen on it."""
+    """Return a picture within so many bytes, a photograph as WebP; None if nothing would be seen on it."""
     if len(thumbnail.data) <= most_bytes:
         return thumbnail
-    if most_bytes < _LEAST_BYTES or thumbnail.media_type == "image/svg+xml":
+    if most_bytes < LEAST_BYTES or thumbnail.media_type == "image/svg+xml":
         return None
     with optional_import("scale"):
-        from PIL import Image
+        from PIL import Image, features
 
     with Image.open(io.BytesIO(thumbnail.data)) as opened:
         opened.load()
+        if opened.mode in ("L", "RGB") and features.check("webp"):
+            return replace(thumbnail, media_type="image/webp", data=_webp(opened, most_bytes))
         encoded = encode_small(opened, most_bytes)
     return replace(thumbnail, media_type=encoded.media_type, data=encoded.data)
+
+
+def _webp(picture: Image.Image, most_bytes: int) -> bytes:
+    """Return the largest WebP of a picture within so many bytes, or the smallest one."""
+
+    def encoded(place: int) -> bytes:
+        side, quality = _WEBP[place]
+        shown, data = picture.copy(), io.BytesIO()
+        shown.thumbnail((side, side))
+        shown.save(data, "WEBP", quality=quality)
+        return data.getvalue()
+
+    fits = bisect_left(range(len(_WEBP) - 1), True, key=lambda place: len(encoded(place)) <= most_bytes)
+    return encoded(fits)

@@ -93,12 +93,23 @@ def changed_attributes(
                 # Not what a loop over a set has left behind in a module, nor what libraries do to each other.
                 is_changed = last.isupper() or "." in name or last in mentioned or f".{last}" in other
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
-                is_changed |= last in named_here
+                is_changed |= last in named_here and name not in _left_by_loops(module)
                 is_changed &= other != value and (other != "None" or last in named_here)
                 is_changed &= not value.startswith(OF_NOTEBOOKS)
             if is_changed:
                 found[module, name] = value, other
     return found
+
+
+@functools.cache
+def _left_by_loops(module: str) -> frozenset[str]:
+    """Return the names that loops of a module's own code have left behind in it, as ``name`` in scipy.sparse._data."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except Exception:  # no source, or what a module of one's own raises when it is asked for it
+        return frozenset()
+    parts = (part for loop in tree.body if isinstance(loop, ast.For) for part in ast.walk(loop))
+    return frozenset(part.id for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
 
 
 def _mentioned(text: str) -> set[str]:

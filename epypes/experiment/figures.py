@@ -1,37 +1,26 @@
 """Figures 14, 15 and 16 of the paper, drawn from the times of an experiment.
 
-Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176. They are Matplotlib's, made without pyplot, so nothing is
-shown twice and no figure stays open. Colours are Okabe and Ito's, which people with any colour vision tell apart. The
-ground is white, so that text is readable in a dark notebook and on any page.
+Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176.
 """
 
 from __future__ import annotations
 
-from io import BytesIO
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from epypes.display.paint.plot import BLUE, PLOT_STYLE, RED, Plot, plot
 from epypes.experiment.results import PAPER, LogNormal, answered, lognormal_fit
 from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Matplotlib's own, whatever users have set for figures of theirs. With a fixed salt, the same figure has the same names
-# inside its SVG.
-_STYLE: Final[list[Any]] = [
-    "default",
-    {"axes.spines.right": False, "axes.spines.top": False, "legend.frameon": False, "svg.hashsalt": "epypes"},
-]
-_BLUE: Final = "#0072b2"
-_RED: Final = "#c44e00"
 _PARTS: Final = {
-    "acquisition.t_rp": ("acquisition", _BLUE),
+    "acquisition.t_rp": ("acquisition", BLUE),
     "vision.t_rp": ("vision", "#e69f00"),
     "o_network": ("network", "#009e73"),
 }
@@ -47,23 +36,7 @@ _BINS: Final = 60
 _MARGIN: Final = 1.5
 
 
-class Drawing(Figure):
-    """A figure of Matplotlib that shows itself in a notebook, whether pyplot has been imported or not."""
-
-    def savefig(self, fname: Any, **options: Any) -> None:
-        """Save the figure as Matplotlib does, in its own style."""
-        with style.context(_STYLE):
-            super().savefig(fname, **options)
-
-    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
-        svg, png = BytesIO(), BytesIO()
-        self.savefig(svg, format="svg", metadata={"Date": None})
-        # For pages that show no SVG, such as that of a notebook which is not trusted.
-        self.savefig(png, format="png")
-        return {"text/plain": repr(self), "image/svg+xml": svg.getvalue().decode(), "image/png": png.getvalue()}
-
-
-@style.context(_STYLE)
+@style.context(PLOT_STYLE)
 def figure_14(table: pd.DataFrame) -> Figure:
     """Draw 100 requests as stacked bars: what acquisition, vision and the network took of each trip.
 
@@ -84,7 +57,7 @@ def figure_14(table: pd.DataFrame) -> Figure:
         It is no table of an experiment.
     """
     has_times = answered(table, *_PARTS)[:_SHOWN_REQUESTS]
-    figure, axes = _blank("Figure 14: where the time of each request goes")
+    figure, axes = plot("Figure 14: where the time of each request goes")
     if not has_times.any():
         return _without_data(figure, axes, has_times)
     shown = table[:_SHOWN_REQUESTS]
@@ -109,7 +82,7 @@ def figure_14(table: pd.DataFrame) -> Figure:
     )
 
 
-@style.context(_STYLE)
+@style.context(PLOT_STYLE)
 def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     """Draw how the graph overhead of the vision component is distributed, beside the paper's.
 
@@ -136,7 +109,7 @@ def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     return _densities(table, "vision.o_cg", "Figure 15: graph overhead", f"o_cg: pipeline time less {less}, µs")
 
 
-@style.context(_STYLE)
+@style.context(PLOT_STYLE)
 def figure_16(table: pd.DataFrame) -> Figure:
     """Draw how the overhead of the vision component's reactive pipeline is distributed, beside the paper's.
 
@@ -148,7 +121,7 @@ def figure_16(table: pd.DataFrame) -> Figure:
 
 def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Figure:
     has_times = answered(table, column)
-    figure, axes = _blank(title)
+    figure, axes = plot(title)
     if not has_times.any():
         return _without_data(figure, axes, has_times)
     rows = table[has_times]
@@ -184,7 +157,7 @@ def _mark(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -
     axes.axvline(least, color="black", linewidth=3, ymax=0.25, label=f"measured: {measured} µs")
     axes.axvline(most, color="black", linewidth=3, ymax=0.25)
     axes.axvline(mode, color="black", linewidth=0.9, label=f"mode: {_number(mode)} µs")
-    axes.axvline(paper, color=_RED, linewidth=1.6, linestyle="--", label=f"the paper's mode: {_number(paper)} µs")
+    axes.axvline(paper, color=RED, linewidth=1.6, linestyle="--", label=f"the paper's mode: {_number(paper)} µs")
     # To the left a fit may reach further than what was measured.
     low = min(least, mode, paper, _US * float(np.exp(whole.mu - _SIGMAS_LEFT * whole.sigma))) / _MARGIN
     high = max(most, mode, paper) * _MARGIN
@@ -207,35 +180,28 @@ def _draw_curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> 
     label = "each experiment"
     for fitted in experiments:
         if fitted.has_curve:
-            axes.fill_between(*density(fitted), color=_BLUE, alpha=0.2, linewidth=0, label=label)
+            axes.fill_between(*density(fitted), color=BLUE, alpha=0.2, linewidth=0, label=label)
             label = ""
-    axes.plot(*density(whole), color=_BLUE, linewidth=2.8, label="all data")
+    axes.plot(*density(whole), color=BLUE, linewidth=2.8, label="all data")
     axes.set(ylabel="probability density, per µs")
     axes.set_ylim(bottom=0)
 
 
-def _blank(title: str) -> tuple[Drawing, Axes]:
-    """Return a figure with a title and nothing in it, and its axes."""
-    figure = Drawing(figsize=(8, 4.2), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
-    figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
-    return figure, figure.add_subplot()
-
-
-def _with_notes(figure: Drawing, axes: Axes, *notes: str, columns: int = 3) -> Drawing:
+def _with_notes(figure: Plot, axes: Axes, *notes: str, columns: int = 3) -> Plot:
     """Return the figure with notes above its axes, and with its legend in so many columns below them."""
     axes.set_title("; ".join(filter(None, notes)), loc="left", fontsize=9)
     figure.legend(loc="outside lower left", ncols=columns, fontsize=9)
     return figure
 
 
-def _with_message(figure: Drawing, axes: Axes, text: str) -> Drawing:
+def _with_message(figure: Plot, axes: Axes, text: str) -> Plot:
     """Return the figure with a sentence instead of axes, where there is nothing to draw."""
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
     return figure
 
 
-def _without_data(figure: Drawing, axes: Axes, has_times: np.ndarray) -> Drawing:
+def _without_data(figure: Plot, axes: Axes, has_times: np.ndarray) -> Plot:
     texts = {0: "There is no request.", 1: "The only request failed."}
     return _with_message(figure, axes, texts.get(len(has_times), f"All {len(has_times)} requests failed."))
 

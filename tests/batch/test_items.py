@@ -93,6 +93,8 @@ def test_an_empty_set_says_what_was_looked_at(tmp_path, runner):
         (np.zeros((4, 5), np.uint8), "Give a list of images"),
         (np.zeros((4, 5, 3), np.uint8), "Give a list of images"),
         (7, "images can't be 'int'"),
+        (b"abc", "content of a file is. Give the path"),
+        (bytearray(b"abc"), "imdecode"),
         ([None], "is None"),
     ],
 )

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import gc
 import os
+import re
+import subprocess
+import sys
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -137,6 +141,21 @@ def test_many_rows_with_thumbnails_stay_small(runner, crops):
     html = result._repr_mimebundle_()["text/html"]
     assert len(html) < 120_000
     assert "and 20 more: to_frame() has all of them" in html
+    assert "pictures more, for which there is no room here" in html
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 12, 60, 100])
+def test_every_row_has_its_thumbnail_smaller_where_there_are_many(runner, count):
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (90, 120, 3), dtype=np.uint8) for _ in range(count)]
+    html = ep.map(runner, noise, show=["image"])._repr_mimebundle_()["text/html"]
+    shown = re.findall('src="data:(image/[a-z]+);base64,([^"]*)"', html)
+    assert len(shown) == count
+    assert sum(len(data) for _, data in shown) <= 80_000
+    assert ({kind for kind, _ in shown} == {"image/webp"}) == (count > 12)
+    side = max(cv2.imdecode(np.frombuffer(base64.b64decode(shown[-1][1]), np.uint8), 1).shape)
+    assert side >= 32
 
 
 # -- going on ---------------------------------------------------------------------------------------------------
@@ -350,3 +369,27 @@ def test_a_stored_outcome_still_says_that_nothing_was_found(tmp_path):
     first, again = (ep.map(runner, images, store=tmp_path / "results.db", name="peaks") for _ in range(2))
     assert [outcome.nothing for outcome in again] == [outcome.nothing for outcome in first] == [("peak",), ()]
     assert values(again, "peak") == [None, 200]
+
+
+@pytest.mark.slow  # another interpreter
+@pytest.mark.parametrize("module", ["page", "vertices", "style"])
+def test_an_import_that_ctrl_c_has_ended_can_be_repeated(module):
+    program = f"""
+import sys
+
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == "epypes.display.paint.{module}" and self in sys.meta_path:
+            sys.meta_path.remove(self)
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, CtrlC())
+import epypes as ep
+
+try:
+    ep.map
+except KeyboardInterrupt:
+    print(ep.map.__name__)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("map_images\n", "")

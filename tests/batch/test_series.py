@@ -174,6 +174,20 @@ def test_keys_that_divide_nothing_are_refused(runner, series, text):
         ep.map(runner, [1.0, 2.0], series=series)
 
 
+def test_what_a_function_of_series_raises_is_its_own_and_names_the_item(runner):
+    with pytest.raises(AttributeError) as raised:
+        ep.map(runner, [1.0, 2.0], series=lambda path: path.parent.name)
+    assert raised.value.__notes__ == [
+        "In series=, which was called with a 'float', the input of item #0. It gets the Path of a file, else the value "
+        "itself."
+    ]
+
+
+def test_a_case_without_any_image_is_named(runner):
+    with pytest.raises(ScaleError, match="The inputs of case 'dark': The image set is empty"):
+        ep.check(runner, [ep.Case([1.0], name="light"), ep.Case([], name="dark")])
+
+
 def test_keys_of_a_graph_without_state_are_a_column_only():
     runner = ep.CompGraphRunner(ep.CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")}))
     frame = ep.map(runner, [1, 2], series="ab"[:0] or ["a", "b"]).to_frame()

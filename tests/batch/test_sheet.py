@@ -173,6 +173,33 @@ def test_the_page_has_a_picture_a_cell_and_marks_failures_with_their_message(run
     assert len(repr(result.sheet())) < 100
 
 
+def test_numbers_stand_below_their_pictures(runner: ep.CompGraphRunner) -> None:
+    result = ep.sweep(runner, {"offset": [1, 13], "gain": [1]})
+    level = result[0].values["level"]
+    assert [tile.numbers for tile in result.sheet().tiles] == [(f"level {level:.4g}",), ()]
+    assert f"<span>level {level:.4g}</span></div>" in html_of(result)
+    assert result.sheet("level").tiles[0].numbers == (), "a number is its own text"
+
+
+def test_a_map_has_a_sheet_too_with_what_failed_first(runner: ep.CompGraphRunner) -> None:
+    images = [np.full((9, 9), value, np.uint8) for value in (1, 2)]
+    result = ep.map(runner, [images[0], "nowhere.png", images[1]], show=["bright"])
+    sheet = result.sheet()
+    assert (sheet.token, sheet.rows, sheet.columns, [block.title for block in sheet.blocks]) == (
+        "bright",
+        None,
+        None,
+        [""],
+    )
+    assert [(tile.label, tile.has_failed, tile.numbers) for tile in sheet.tiles] == [
+        ("nowhere.png", True, ()),
+        ("#0", False, ("level 1.0",)),
+        ("#2", False, ("level 2.0",)),
+    ]
+    with pytest.raises(ScaleError, match="No pictures of 'image' were kept"):
+        result.sheet("image")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [5, 30, 130, 700])
 def test_the_page_is_no_larger_than_other_pictures_and_says_what_is_left_out(

@@ -25,7 +25,7 @@ def wait_until_drawn(notebook: Notebook) -> None:
     notebook.page.wait_for_function(
         """() => {
             const figures = [...document.querySelectorAll('figure.epypes-figure')];
-            return figures.length && figures.every(each => each.querySelector('svg.epypes-graph'));
+            return figures.length && figures.every(each => each.querySelector('svg'));
         }"""
     )
     assert not notebook.page_errors
@@ -53,4 +53,30 @@ def test_every_graph_that_is_saved_in_a_tutorial_is_drawn_when_it_is_opened(
     lab.api(f"contents/{copy.name}/trust", "POST")
     notebook = Notebook(lab_page, copy.name)
     wait_until_drawn(notebook)
+    notebook.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "slider", "key"),
+    [
+        ("03_tuning", "low", "ArrowRight"),
+        ("06_operate", "quality", "ArrowRight"),
+        ("07_many_images", "lo", "ArrowRight"),
+    ],
+)
+def test_a_tutorial_ends_with_a_panel_that_can_be_moved(lab_page: Any, name: str, slider: str, key: str) -> None:
+    notebook = Notebook(lab_page, f"{name}.ipynb")
+    notebook.run_all()
+    panel = lab_page.locator(".jp-Cell").last.locator(".epypes-panel")
+    panel.scroll_into_view_if_needed()
+    picture = panel.locator("img.epypes-picture")
+    value = "(picture, name) => JSON.parse(picture.dataset.values ?? '{}')[name]"
+    lab_page.wait_for_function("picture => picture.dataset.values", arg=picture.element_handle())
+    before = picture.evaluate(value, slider)
+    panel.locator(".widget-slider", has_text=slider).first.locator(".noUi-handle").first.focus()
+    lab_page.keyboard.press(key)
+    lab_page.wait_for_function(
+        "([picture, name, before]) => JSON.parse(picture.dataset.values)[name] > before",
+        arg=[picture.element_handle(), slider, before],
+    )
     notebook.close()

@@ -270,3 +270,15 @@ def test_a_function_that_reaches_what_no_name_says_is_refused_with_its_line(name
     before, used = REFLECTIONS[name]
     text = refusal(monkeypatch, tmp_path, "K = 3", branch(used, before))
     assert f"Function 'use' uses {name!r} (cell [2], line {branch(used, before).count(chr(10)) + 1})" in text
+
+
+def test_what_a_loop_over_a_set_has_left_in_a_library_is_no_change_whatever_words_the_notebook_has(
+    monkeypatch, tmp_path
+):
+    import scipy.sparse
+
+    # In which order it goes through the set depends on the process.
+    monkeypatch.setattr(scipy.sparse._data, "name", "another one")
+    cells = ("import scipy.sparse\ndef use(x):\n    return scipy.sparse.csr_array(x).nnz", "columns = ['name']")
+    names = in_notebook(monkeypatch, *cells, RUN, ep=ep, np=np, cv2=cv2, x=X)
+    ep.promote(names["runner"], tmp_path / "bundle")

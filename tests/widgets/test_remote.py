@@ -448,7 +448,9 @@ def test_what_a_service_can_not_do_is_said(connection: Connection, panel: Panel,
     assert "a running service is a bundle already" in screen.last("promoted")["text"]
     with pytest.raises(ServiceError, match="Function 'above' runs in the service at"):
         panel.result.cg.functions["above"](image, 3)
-    with pytest.raises(TypeError, match="tune\\(\\) takes a CompGraphRunner or a connection to a service, not 'str'"):
+    with pytest.raises(
+        TypeError, match="tune\\(\\) takes a CompGraphRunner, a connection to a service, or functions, not 'str'"
+    ):
         tune("http://127.0.0.1:8642")  # type: ignore[arg-type]
 
 

@@ -7,7 +7,8 @@
     panel = tune(runner, canny_lo=(0, 255), blur_kernel=ep.Param(1, 31, odd=True))
     panel
 
-``panel`` has the panel and ``tune``. From a control to the screen:
+or, for one function, ``interact(edges, image, lo=(0, 255))``. ``panel`` has the panel, ``tune`` and ``interact``;
+``functions`` makes the runner of plain functions. From a control to the screen:
 
 - ``controls``: the widgets that move hyperparameters, and which are held; ``scale``: the values along a slider;
   ``column``: how they stand on the page
@@ -29,7 +30,7 @@ from __future__ import annotations
 from epypes.optional import optional_import
 
 with optional_import():
-    from epypes_widgets.panel import Panel, tune
+    from epypes_widgets.panel import Panel, interact, tune
     from epypes_widgets.picking import Picker, pick
 
-__all__ = ["Panel", "Picker", "pick", "tune"]
+__all__ = ["Panel", "Picker", "interact", "pick", "tune"]

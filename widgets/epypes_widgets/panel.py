@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from epypes_widgets import code, settings
 from epypes_widgets.cases import Cases, read_cases
 from epypes_widgets.column import column
 from epypes_widgets.controls import ControlSet, controls
+from epypes_widgets.functions import Made, are_functions, made_runner
 from epypes_widgets.history import StoredHistory, history_of
 from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
@@ -63,6 +64,8 @@ class Panel(Displayed):
         Where each committed setting is kept, and under which name; None to keep nothing.
     search
         Of hyperparameters; None if there is no metric.
+    is_made
+        Whether the runner was made for the panel, so that no name of the notebook has it.
 
     Attributes
     ----------
@@ -80,8 +83,10 @@ class Panel(Displayed):
         store: str | Path | Store | None,
         name: str | None,
         search: Search | None,
+        is_made: bool = False,
     ) -> None:
         self._controls, self._session, self._runner, self.search = controls, session, session.runner, search
+        self._is_made = is_made
         cg: CompGraph = self._runner.cg
         self._history = history_of(self._runner)
         self._column = column(cg, controls.controls)
@@ -105,6 +110,19 @@ class Panel(Displayed):
         self._cases.begin()
 
     # -- values -------------------------------------------------------------------------------------------------
+
+    @property
+    def runner(self) -> CompGraphRunner:
+        """What is tuned: the runner that was given, or was made of functions; its graph is ``panel.runner.cg``.
+
+        Raises
+        ------
+        TypeError
+            A service is tuned, whose runner is in its worker process.
+        """
+        if not isinstance(self._runner, CompGraphRunner):
+            raise TypeError("A service is tuned, so there is no runner here. Ask what ep.connect has returned.")
+        return self._runner
 
     @property
     def values(self) -> dict[str, Any]:
@@ -140,7 +158,8 @@ class Panel(Displayed):
         first, runner = self._runner.first_hyperparameters, self._runner
         values = {**first, **self.values}
         if isinstance(runner, CompGraphRunner):
-            return code.line(code.name_of(runner), first, values, self._controls.params)
+            default = f"{code.name_of(self, default='panel')}.runner" if self._is_made else "runner"
+            return code.line(code.name_of(runner, default=default), first, values, self._controls.params)
         name = code.name_of(runner.connection, default="service")
         return code.line(name, first, values, self._controls.params, verb="set")
 
@@ -402,8 +421,54 @@ def _made_from(cg: CompGraph, token: str) -> list[str]:
     return sorted(found)
 
 
+def interact(functions: Any, /, *payload: Any, **abbreviations: Any) -> Panel:
+    """Show controls for the parameters of a function, and the picture that it makes: one line for one function.
+
+    It is ``tune`` on a runner that is made inside, as ``panel.runner``.
+
+    Parameters
+    ----------
+    functions
+        A function. Or a list of functions, each of which takes what others make by the names of its parameters, as
+        ``CompGraph.from_functions`` joins them; or a graph. Of a function that returns several values, an image among
+        them, each is a token: ``edges_1``, ``edges_2``, or as ``@ep.outputs`` names them.
+    payload
+        What the first parameters get: the image. They have no controls.
+    abbreviations
+        By parameter, as in ``ipywidgets.interact``: a number, a text or a truth value, where the control begins; a
+        range ``(low, high)`` or ``(low, high, step)``; a list of choices, or a dict of choices by their labels; an
+        ``ep.Param`` or ``ep.Roi``. A range begins at the parameter's default, else in its middle. Arrays, and
+        ``ipywidgets.fixed(value)``, have no controls. A parameter without any of these has its default, and the range
+        that its annotation or the tables of OpenCV and scikit-image know.
+
+    Returns
+    -------
+    Panel
+        As the last expression of a cell it shows itself.
+
+    Raises
+    ------
+    GraphError, TypeError, ValueError, UnknownName, PayloadError
+        The functions can't be tuned, such as a lambda or one with ``*args``; a parameter has no value; a keyword is for
+        no parameter; the image is None. Each says the way out.
+    Exception
+        Whatever a function raises on the first run.
+
+    Examples
+    --------
+    >>> def scale(x, factor, offset=1):
+    ...     return factor * x + offset
+    >>> panel = interact(scale, 10, factor=(0, 4))
+    >>> panel.values, panel.result["scale"]
+    ({'factor': 2, 'offset': 1}, 21)
+    >>> panel.code()
+    'panel.runner.rerun()'
+    """
+    return tune(made_runner(functions, payload, abbreviations, "interact"))
+
+
 def tune(
-    tuned: CompGraphRunner | Connection,
+    tuned: CompGraphRunner | Connection | Callable[..., Any] | Sequence[Callable[..., Any]] | CompGraph | Made,
     /,
     *,
     images: Iterable[Any] | str | Path | None = None,
@@ -422,7 +487,8 @@ def tune(
     tuned
         A runner that has been run, so that there is a payload, unless ``images`` are given. Or what ``ep.connect``
         has returned: then the picture follows the service's own events, values are set there, with their revision, and
-        what other clients set at the same time is never overwritten unseen.
+        what other clients set at the same time is never overwritten unseen. Or a function, a list of functions or a
+        graph, with its payload by name, ``tune(edges, image=image, lo=(0, 255))``: see ``interact``.
     images
         Test images to switch between: values of the one free source token, or dicts by token. Or a video, as
         ``ep.video(path)`` or its path: then the panel has a slider of its frames, each of which is read when it is
@@ -448,7 +514,7 @@ def tune(
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
         Without, the annotation of the function that takes it counts, then the table of OpenCV's and scikit-image's
         parameters, then its value; what can't be moved is shown. A hyperparameter called as one of the above gets
-        its hint from its annotation.
+        its hint from its annotation. With functions also their payload, and values, as ``interact`` takes them.
 
     Returns
     -------
@@ -487,7 +553,9 @@ def tune(
     >>> panel.code()
     'runner.rerun(y=5)'
     """
-    runner = tunable(tuned)
+    if are_functions(tuned):
+        tuned = made_runner(tuned, (), hints, "tune", has_images=images is not None or cases is not None)
+    runner, hints = (tuned.runner, tuned.hints) if isinstance(tuned, Made) else (tunable(tuned), hints)
     if token is not None:
         runner.cg.require_token(token)
     found = read_cases(runner, images, cases)
@@ -508,4 +576,4 @@ def tune(
         looked_at = [looked_at]  # the frames of one case
     search = None if metric is None else Search(runner, metric, direction, looked_at, control_set.params)
     session.begin()
-    return Panel(control_set, session, token, found, store, name, search)
+    return Panel(control_set, session, token, found, store, name, search, isinstance(tuned, Made))

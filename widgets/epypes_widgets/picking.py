@@ -232,6 +232,7 @@ def _tile(result: SweepResult, pictures: dict[bytes, int], tile: Tile) -> dict[s
     return {
         "place": tile.place,
         "label": tile.label,
+        "numbers": list(tile.numbers),
         "text": cut(tile.text, _TEXT_CHARACTERS),
         "failed": tile.has_failed,
         "setting": setting_text(result[tile.place].setting),

@@ -125,8 +125,8 @@ def _read(runner: Tunable, name: str, hint: Any) -> Param | Roi:
         raise ValueError(f"Hint of {name!r}: {error}") from error
     if param is None:
         raise TypeError(
-            f"Hint of {name!r} is {hint!r:.60}. Give an ep.Param, a tuple as a range (low, high), a list of choices, "
-            "or an ep.Roi."
+            f"Hint of {name!r} is {hint!r:.60}. Give an ep.Param, a tuple as a range (low, high), a list or dict of "
+            "choices, or an ep.Roi."
         )
     if not allows(param, value):
         raise ValueError(

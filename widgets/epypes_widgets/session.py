@@ -36,8 +36,8 @@ def tunable(given: object) -> Tunable:
     found: Any = given.to_tune() if hasattr(given, "to_tune") else given
     if not isinstance(found, CompGraphRunner) and not hasattr(found, "connection"):
         raise TypeError(
-            f"tune() takes a CompGraphRunner or a connection to a service, not {type(given).__name__!r}: "
-            "tune(CompGraphRunner(cg, hparams)), tune(ep.connect(url))."
+            f"tune() takes a CompGraphRunner, a connection to a service, or functions, not {type(given).__name__!r}: "
+            "tune(CompGraphRunner(cg, hparams)), tune(ep.connect(url)), tune(function, image=image)."
         )
     tuned: Tunable = found
     return tuned

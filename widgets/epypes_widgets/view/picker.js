@@ -39,17 +39,17 @@ function render({ model, el }) {
     for (const each of tiles()) each.tabIndex = each === reached ? 0 : -1;
   }
 
-  function tile({ place, setting, failed, text, picture, label }) {
-    const what = `${setting}: ${failed ? "failed, " : ""}${text}`;
+  function tile({ place, setting, failed, text, picture, label, numbers }) {
+    const what = `${setting}: ${failed ? "failed, " : ""}${[text, ...numbers].filter(Boolean).join(", ")}`;
     const name = failed ? "epypes-picker-tile epypes-picker-failed" : "epypes-picker-tile";
     const words = () => element("span", "epypes-picker-text", {}, failed ? element("b", "", {}, "failed ") : null, text);
     const shown = failed || picture === null ? words() : element("img", "", { alt: "", draggable: "false", src: urls[picture] });
-    const caption = label ? element("span", "epypes-picker-label", {}, label) : null;
+    const captions = [label, ...numbers].filter(Boolean).map((line) => element("span", "epypes-picker-label", {}, line));
     const made = button(name, { "data-place": place, "aria-label": what, title: what }, () => {
       reach(made);
       made.focus();
       send({ kind: "pick", place });
-    }, shown, caption);
+    }, shown, ...captions);
     return made;
   }
 

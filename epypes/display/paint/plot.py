@@ -1,0 +1,96 @@
+"""Plots: figures of Matplotlib that show themselves in a notebook, in the colours of its theme.
+
+On paper a plot is black on white. On a page its colours are those of the theme, as in pictures of graphs (``page.py``),
+and its ground is that of the page; all other colours are chosen to be seen on light and on dark. Plots are made
+without pyplot, so nothing is shown twice and no figure stays open.
+"""
+
+from __future__ import annotations
+
+import re
+from io import BytesIO
+from typing import Any, Final
+
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from epypes.display.paint.page import paint_figure, paint_page
+
+# Matplotlib's own, whatever users have set for figures of theirs. With a fixed salt, the same figure has the same names
+# inside its SVG.
+PLOT_STYLE: Final[list[Any]] = [
+    "default",
+    {
+        "axes.spines.right": False,
+        "axes.spines.top": False,
+        "legend.frameon": False,
+        "svg.hashsalt": "epypes",
+    },
+]
+# Okabe and Ito's, which people with any colour vision tell apart; the red is darker, to be seen on white.
+BLUE: Final = "#0072b2"
+RED: Final = "#c44e00"
+# What Matplotlib writes -> what a page has instead, in this order. An image knows no variables, and has what stands on
+# paper; on a page no rule of a plot is one for all pictures; names of fonts have quotes that an address can't hold.
+_THEMED: Final = {
+    r"^.*?(?=<svg )|<metadata>.*?</metadata>|<!--.*?-->|<defs>\s*<style.*?</style>\s*</defs>": "",
+    r"(<svg[^>]*?) height=\S+": r"\1",  # follows the width, which is no more than that of the page
+    '<g id="figure_1">': '<g id="figure_1" style="fill: #000000; stroke-linejoin: round">',
+    "#000000": "var(--epypes-text,#000000)",
+    "#ffffff": "var(--epypes-paper,#ffffff)",
+    BLUE: f"var(--epypes-accent,{BLUE})",
+    RED: f"var(--epypes-warn,{RED})",
+    r"(font-family:|font: (?:\w+ )*[\d.]+px) [^;\"]*": r"\1 var(--jp-ui-font-family,sans-serif)",
+    r"(\.\d\d)\d+(?=[^<>]*>)": r"\1",
+    r"\s*\n\s*": " ",
+}
+# The ground of outputs, so that none is seen; on a page without a theme text is dark, and needs a light one.
+_PAPER: Final = "var(--jp-layout-color0,var(--vscode-editor-background,#ffffff))"
+
+
+class Plot(Figure):
+    """A figure of Matplotlib that shows itself in a notebook, whether pyplot has been imported or not."""
+
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Save the figure as Matplotlib does, in its own style."""
+        with style.context(PLOT_STYLE):
+            super().savefig(fname, **options)
+
+    @property
+    def alt(self) -> str:
+        """What is drawn, in words."""
+        titles = [axes.get_title(loc="left") for axes in self.axes]
+        return ". ".join(filter(None, (self.get_suptitle(), *titles)))
+
+    def html(self) -> str:
+        """Return the figure as an element for ``paint_page``."""
+        return self._themed(self._svg())
+
+    def _svg(self) -> str:
+        svg = BytesIO()
+        # In a file letters are drawn. Here they stay text, which is smaller, and which screen readers read.
+        with style.context([*PLOT_STYLE, {"svg.fonttype": "none"}]):
+            super().savefig(svg, format="svg", metadata={"Date": None})
+        return svg.getvalue().decode()
+
+    def _themed(self, svg: str) -> str:
+        for written, themed in _THEMED.items():
+            svg = re.sub(written, themed, svg, flags=re.DOTALL)
+        return f'<div style="--epypes-paper:{_PAPER}">{paint_figure(svg, self.alt)}</div>'
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        svg, png = self._svg(), BytesIO()
+        # For what shows neither, such as a document made by LaTeX.
+        self.savefig(png, format="png")
+        page = paint_page(self._themed(svg))
+        return {"text/plain": repr(self), "text/html": page, "image/svg+xml": svg, "image/png": png.getvalue()}
+
+
+def plot(title: str = "", width: float = 8.0, height: float = 4.2) -> tuple[Plot, Axes]:
+    """Return a figure with a title and nothing in it, of a size in inches, and its axes; call it in PLOT_STYLE."""
+    figure = Plot(figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
+    if title:
+        figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
+    return figure, figure.add_subplot()
