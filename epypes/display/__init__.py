@@ -8,7 +8,7 @@ from epypes.display.previews.images import is_image
 from epypes.display.previews.preview import register_preview
 from epypes.display.views.full_pictures import full_picture
 from epypes.display.views.graphview import GraphView
-from epypes.display.views.surroundings import reset_display_ranges, scene_of
+from epypes.display.views.surroundings import reset_display_ranges, scalar_owners, scene_of
 from epypes.display.views.view import view
 from epypes.rich_display import Formatters, register
 
@@ -30,6 +30,7 @@ __all__ = [
     "mimebundle",
     "register_preview",
     "reset_display_ranges",
+    "scalar_owners",
     "scene_of",
     "scene_picture",
     "show",

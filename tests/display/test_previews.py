@@ -182,12 +182,12 @@ def test_many_small_objects_are_labels_whatever_their_size(radii, seed):
     for number in range(1, 36):
         centre = (int(rng.integers(8, 162)), int(rng.integers(8, 120)))
         cv2.circle(labels, centre, int(rng.integers(radii[0], radii[-1] + 1)), number, -1)
-    assert preview(labels).detail.endswith(f"{len(np.unique(labels)) - 1} labels")
+    assert f", {len(np.unique(labels)) - 1} labels of " in preview(labels).detail
 
 
 def test_one_object_that_fills_an_image_and_none_at_all_are_labels():
-    assert preview(np.ones((64, 64), np.int32)).detail.endswith("1 label")
-    assert preview(np.zeros((64, 64), np.int32)).detail.endswith("0 labels")
+    assert preview(np.ones((64, 64), np.int32)).detail == "int32 64 x 64, 1 label of 4096 px, 16.4 kB"
+    assert preview(np.zeros((64, 64), np.int32)).detail == "int32 64 x 64, 0 labels, 16.4 kB"
     assert "label" not in preview(np.full((64, 64), 127, np.int32)).detail
     assert "label" not in preview(np.zeros((64, 64), np.int16)).detail
 

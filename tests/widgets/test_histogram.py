@@ -67,14 +67,35 @@ def test_a_thin_line_of_a_large_mask_is_counted_whole() -> None:
     assert not said["sampled"]
 
 
-def test_labels_are_counted_one_by_one() -> None:
+def test_of_labels_their_number_and_areas_are_told() -> None:
     labels = np.zeros((60, 60), np.int32)
-    labels[:20, :20] = 300
+    labels[:20, :10] = 300
     labels[30:50, 30:50] = 7
+    labels[55:, :5] = 8
     said = counted(labels)
-    counts = gray(said)
-    assert (said["low"], said["high"]) == (0, 300)
-    assert {value: count for value, count in enumerate(counts) if count} == {0: 2800, 7: 400, 300: 400}
+    assert said["labels"] == "3 labels of 25 to 400 px, median 200 px; background 83%"
+    assert said["channels"] == [{"name": "areas", "counts": [400, 200, 25]}]
+    assert (said["low"], said["high"], said["bins"]) == (1, 3, 3)
+
+
+def test_of_one_label_and_of_none_the_area_is_told_if_there_is_one() -> None:
+    labels = np.zeros((60, 60), np.int32)
+    assert counted(labels)["labels"] == "0 labels; background 100%"
+    labels[:20, :10] = 300
+    assert counted(labels)["labels"] == "1 label of 200 px; background 94%"
+
+
+def test_of_very_many_labels_some_have_a_bar_the_largest_and_the_smallest_too() -> None:
+    labels = np.repeat(np.repeat(np.arange(900, dtype=np.int32).reshape(30, 30) + 1, 20, axis=0), 20, axis=1)
+    labels[:20, :19] = 2
+    said = counted(labels)
+    assert said["labels"].startswith("900 labels of 20 to 780 px")
+    counts = said["channels"][0]["counts"]
+    assert (counts[0], counts[-1], len(counts)) == (780, 20, 256)
+
+
+def test_a_histogram_of_anything_but_labels_tells_of_none() -> None:
+    assert "labels" not in counted(np.random.default_rng(0).integers(0, 256, (90, 70), np.uint8))
 
 
 def test_floats_are_counted_where_they_are_nearest_and_nan_nowhere() -> None:
@@ -143,6 +164,9 @@ _DTYPES = st.sampled_from(["?", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", 
 def test_every_pixel_of_any_image_is_counted_once(image: Any) -> None:
     said = counted(image)
     assert said["low"] <= said["high"]
+    if "labels" in said:
+        assert sum(said["channels"][0]["counts"]) <= np.count_nonzero(image > 0)
+        return
     numbers = image.size if image.dtype.kind != "f" else np.count_nonzero(~np.isnan(image))
     if image.ndim == 3 and image.shape[2] == 4:
         kept = image[:, :, :3]

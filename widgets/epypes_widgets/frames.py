@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Container, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display import Marks, Most, Picture, Scene, encode_image, scene_of, scene_picture
+from epypes.display import Marks, Most, Picture, Scene, encode_image, is_image, scene_of, scene_picture
 from epypes.images import has_colours
 from epypes.run import Run
 from epypes_widgets.histogram import histogram_of
-from epypes_widgets.values import json_values
+from epypes_widgets.picture_settings import NO_LIMITS, Limits, within_limits
+from epypes_widgets.values import json_values, short_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -90,8 +91,13 @@ def make_frame(
     content
         Is sent as it is.
     """
-    drawn = partial(picture, run, had_pictures=had_pictures)
+    drawn, limits = partial(picture, run, had_pictures=had_pictures, limits=shown.limits), shown.limits
     pictures = [drawn(token, "main")]
+    main, over = pictures[0][0], shown.settings(token).over
+    if main.get("image") == token and main["kind"] in ("mask", "labels"):
+        main["beneath"] = _alike(run, token, (main["full_height"], main["full_width"]), had_pictures)
+        if over in main["beneath"]:
+            pictures.append(drawn(over, "under"))
     if shown.other:
         pictures.append(drawn(shown.other, "other"))
     pictures += [drawn(pinned, "pinned", max_side_px=PINNED_SIDE_PX) for pinned in shown.pinned]
@@ -107,24 +113,46 @@ def make_frame(
         "reused": len(report.reused),
         "skipped": len(report.skipped),
         "pictures": [described for described, _ in pictures],
-        "histogram": histogram_of(run, token) if shown.has_histogram else None,
-        "histograms": {cut: histogram_of(run, cut) for cut in shown.cut} if shown.has_histogram else {},
+        "histogram": histogram_of(run, token, limits) if shown.has_histogram else None,
+        "histograms": {cut: histogram_of(run, cut, limits) for cut in shown.cut} if shown.has_histogram else {},
+        "scalars": [{"token": name, "text": short_text(run[name])} for name in shown.scalars if _is_fresh(run, name)],
         **content,
     }
     return Frame(seq, content, tuple(data for _, data in pictures if data), changed_ns)
 
 
+def _is_fresh(run: Run, token: str) -> bool:
+    return run.tokens.is_computed(token) and not run.tokens.is_stale(token)
+
+
+def _alike(run: Run, token: str, size: tuple[int, int], pictures: Container[str]) -> list[str]:
+    """Return the other tokens that are images of the same height and width, up to date or not."""
+    values = dict(zip(run.tokens.program.tokens, run.tokens.values, strict=True))
+    others = (name for name in run.cg.tokens if name != token and name in pictures)
+    return [name for name in others if is_image(values[name]) and values[name].shape[:2] == size]
+
+
 def picture(
-    run: Run, token: str, role: str, max_side_px: int = MAX_SIDE_PX, had_pictures: Container[str] = ()
+    run: Run,
+    token: str,
+    role: str,
+    max_side_px: int = MAX_SIDE_PX,
+    had_pictures: Container[str] = (),
+    limits: Limits = NO_LIMITS,
 ) -> tuple[dict[str, Any], bytes]:
     """Return what the front end gets of a token, and its bytes: an image, marks over their image, or a text."""
     found = scene(run, token, had_marks=token in had_pictures)
     described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
     if found is None:
         return {**described, "media_type": "text/plain", "text": _text_in_place(run, token)}, b""
-    image = found.backdrop.image
-    encoded = encode_image(image, max_side_px, found.backdrop.order, found.backdrop.ends)
+    seen = within_limits(found.backdrop, limits)
+    image = seen.image
+    encoded = encode_image(image, max_side_px, seen.order, seen.ends)
     described |= {
+        "image": seen.name,
+        "kind": encoded.kind,
+        "range": [float(end) for end in found.backdrop.ends],
+        "limits": [float(end) for end in seen.ends],
         "overlay": overlay(found),
         "media_type": encoded.media_type,
         "width": encoded.width,
@@ -157,15 +185,19 @@ def _order_text(run: Run, backdrop: Backdrop) -> str:
     return backdrop.order + ", assumed" * is_assumed
 
 
-def still_picture(run: Run, token: str, max_side_px: int, most_bytes: int) -> Picture | None:
+def still_picture(
+    run: Run, token: str, max_side_px: int, most_bytes: int, limits: Limits = NO_LIMITS
+) -> Picture | None:
     """Return a token as one picture, its marks drawn over their image; None if it is none, or not up to date."""
     found = scene_of(run, token, had_marks=True)
-    return None if found is None else scene_picture(found, max_side_px, most_bytes)
+    if found is None:
+        return None
+    return scene_picture(replace(found, backdrop=within_limits(found.backdrop, limits)), max_side_px, most_bytes)
 
 
-def thumbnail(run: Run, token: str | None) -> Picture | None:
+def thumbnail(run: Run, token: str | None, limits: Limits = NO_LIMITS) -> Picture | None:
     """Return the thumbnail of a token, of at most 96 x 96 pixels; None if it is no picture, or not up to date."""
-    return None if token is None else still_picture(run, token, _THUMBNAIL_PX, _THUMBNAIL_BYTES)
+    return None if token is None else still_picture(run, token, _THUMBNAIL_PX, _THUMBNAIL_BYTES, limits)
 
 
 def scene(run: Run, token: str, *, had_marks: bool = False) -> Scene | None:

@@ -1,4 +1,4 @@
-"""The histogram of an image: how often it has which value.
+"""The histogram of an image: how often it has which value; of labels, how many there are and how large they are.
 
 Bins are counted from the value ``low`` to the value ``high``, both included: bin i holds what is nearest to
 ``low + i * (high - low) / (bins - 1)``. What lies beyond, as it may in an image whose display range was kept, is in
@@ -11,9 +11,10 @@ import math
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display import Backdrop, is_image, scene_of
-from epypes.display.previews.images import image_kind, one_channel, sampled
+from epypes.display.previews.images import image_kind, label_areas, label_text, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
 from epypes.run import Run
+from epypes_widgets.picture_settings import NO_LIMITS, Limits, within_limits
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,17 +23,16 @@ if TYPE_CHECKING:
     Array = npt.NDArray[Any]
 
 _BINS: Final = 256
-_MOST_LABELS: Final = 1_024
 # To count more takes longer than a picture may wait, and the shape is the same.
 MOST_PX: Final = 262_144
 _COLOURS: Final = {"bgr": "BGR", "rgb": "RGB"}
 
 
-def histogram_of(run: Run, token: str) -> dict[str, Any] | None:
-    """Return the histogram of a token that is an image and up to date; None of any other."""
+def histogram_of(run: Run, token: str, limits: Limits = NO_LIMITS) -> dict[str, Any] | None:
+    """Return the histogram of a token that is an image and up to date, within its limits; None of any other."""
     is_shown = is_image(run.tokens.values[run.tokens.program.slots[token]])
     scene = scene_of(run, token) if is_shown else None
-    return None if scene is None else histogram(scene.backdrop)
+    return None if scene is None else histogram(within_limits(scene.backdrop, limits))
 
 
 def histogram(seen: Backdrop) -> dict[str, Any]:
@@ -41,24 +41,30 @@ def histogram(seen: Backdrop) -> dict[str, Any]:
     Parameters
     ----------
     seen
-        The image, at most so many pixels of which are counted: evenly spread ones. Masks are counted whole.
+        The image, at most so many pixels of which are counted: evenly spread ones. Masks are counted whole, labels
+        up to 1 MP.
 
     Returns
     -------
     dict
         ``low`` and ``high``: the values of the first and of the last bin; ``bins``: how many there are: one for each
-        value of bytes, labels and masks, else at most 256 over the display range; ``channels``: ``name`` and
-        ``counts`` of each but alpha; ``sampled``: whether not all pixels were counted.
+        value of bytes and masks, else at most 256 over the display range; ``channels``: ``name`` and ``counts`` of each
+        but alpha; ``sampled``: whether not all pixels were counted; ``labels``: of labels how many there are, and how
+        large; ``counts`` are then their areas in pixels, the largest first, of very many evenly chosen ones.
     """
     image = one_channel(seen.image)
-    kind = image_kind(image, sampled(image))
+    kind = image_kind(image, few := sampled(image))
     if kind == "mask":
         return _of_mask(image)
+    if kind == "labels":
+        return _of_labels(few, image.size)
     stride = max(1, math.ceil(math.sqrt(image.shape[0] * image.shape[1] / MOST_PX)))
     sample = image[::stride, ::stride]
     with silent_numpy():
-        low, high = _ends(sample, seen.ends, kind)
-        bins = _bins(sample, low, high, kind)
+        low, high = seen.ends
+        if sample.dtype.kind in "bui":
+            low, high = int(low), int(high)
+        bins = _bins(sample, low, high)
         channels = [sample] if sample.ndim == 2 else [sample[:, :, place] for place in range(3)]
         counts = [_counted(channel, low, high, bins).tolist() for channel in channels]
     names = ["gray"] if sample.ndim == 2 else list(_COLOURS[seen.order])
@@ -84,19 +90,21 @@ def _of_mask(mask: Array) -> dict[str, Any]:
     return _plain(0, white, {"gray": [mask.size - set_px, set_px]}, False)
 
 
-def _ends(sample: Array, shown: tuple[float, float], kind: str) -> tuple[float, float]:
-    if kind == "labels":
-        return min(int(sample.min()), 0), int(sample.max())
-    low, high = shown
-    return (int(low), int(high)) if sample.dtype.kind in "bui" else (low, high)
+def _of_labels(labels: Array, pixels: int) -> dict[str, Any]:
+    import numpy as np
+
+    areas = label_areas(labels, pixels)
+    kept = areas[np.linspace(0, max(len(areas) - 1, 0), min(len(areas), _BINS)).astype(np.intp)].tolist()
+    background = np.count_nonzero(labels == 0) / labels.size
+    is_sample = labels.size < pixels
+    text = f"{label_text(areas, is_sample=is_sample)}; background {background:.0%}"
+    return {**_plain(1, max(len(areas), 1), {"areas": kept}, is_sample), "labels": text}
 
 
-def _bins(sample: Array, low: float, high: float, kind: str) -> int:
+def _bins(sample: Array, low: float, high: float) -> int:
     if sample.dtype.kind == "f":
         return _BINS
-    values = int(high) - int(low) + 1
-    most = _MOST_LABELS if kind == "labels" else _BINS
-    return values if values <= most else _BINS
+    return min(int(high) - int(low) + 1, _BINS)
 
 
 def _counted(channel: Array, low: float, high: float, bins: int) -> npt.NDArray[np.intp]:

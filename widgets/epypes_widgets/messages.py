@@ -1,7 +1,7 @@
 """What a panel does with each message of its view.
 
 Each is handled on the thread that handles the messages of the front end, and returns at once: nothing is computed here
-but a probe, which reads a pixel of pictures that are there.
+but a probe, which reads a pixel of pictures that are there, and contrast limits, which are found in one of them.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from epypes.display import reset_display_ranges
 from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.cases import Cases
 from epypes_widgets.frames import scene
+from epypes_widgets.picture_settings import auto_limits
 from epypes_widgets.promotion import BundleJob, Outcome
 from epypes_widgets.screen import Comparison
 from epypes_widgets.stages import probe
@@ -23,6 +25,7 @@ from epypes_widgets.tuning import Tuning
 from epypes_widgets.view import Handler, Message
 
 if TYPE_CHECKING:
+    from epypes.display.previews.images import Range
     from epypes_widgets.panel import Panel
 
 
@@ -67,7 +70,9 @@ class Messages:
             "pin": self._pin,
             "compare": self._compare,
             "histogram": lambda message: tuning.look(has_histogram=bool(message["on"])),
+            "scalars": lambda message: tuning.look(has_scalars=bool(message["on"])),
             "probe": self._probe,
+            "picture": self._picture,
             "undo": lambda _: tuning.undo(),
             "redo": lambda _: tuning.go_to(tuning.history.redo),
             "goto": lambda message: tuning.go_to(lambda: tuning.history.goto(int(message["number"]))),
@@ -131,6 +136,21 @@ class Messages:
             token = self._screen.require_stage(asked["token"]) if asked["kind"] == "stage" else ""
             comparison = Comparison(str(asked["kind"]), int(asked.get("number", 0)), token)
         self._tuning.look(comparison=comparison)
+
+    def _picture(self, message: Message) -> None:
+        token, change = str(message["token"]), dict(message["change"])
+        if change.get("limits") == "auto":
+            change["limits"] = self._auto_limits()
+        elif "limits" in change and change["limits"] is None:
+            reset_display_ranges(self._tuning.session.result or self._tuning.runner, token)
+        self._screen.change_picture(token, change)
+        if change.keys() & {"limits", "over"}:
+            self._tuning.look()
+
+    def _auto_limits(self) -> Range | None:
+        run, token = self._tuning.session.result, self._screen.shown.token
+        seen = None if run is None or token is None else scene(run, token)
+        return None if seen is None else auto_limits(seen.backdrop.image)
 
     def _probe(self, message: Message) -> None:
         run, token = self._tuning.session.result, self._screen.shown.token

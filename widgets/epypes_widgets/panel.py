@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from epypes_widgets.functions import Made, are_functions, made_runner
 from epypes_widgets.history import StoredHistory, history_of
 from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
+from epypes_widgets.picture_settings import PictureSettings
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
 from epypes_widgets.search import Search
@@ -222,6 +223,34 @@ class Panel(Displayed):
         self._tuning.look(token=self._screen.require_stage(token))
 
     @property
+    def pictures(self) -> Mapping[str, PictureSettings]:
+        """How pictures are shown, by the token of the image, where that was changed."""
+        return dict(self._screen.shown.pictures)
+
+    def show_as(self, token: str, **settings: Any) -> None:
+        """Change how the picture of a token is shown, as the controls above the picture do.
+
+        Parameters
+        ----------
+        token
+            The image: of what is drawn over one, that one.
+        settings
+            ``limits=(0, 4095)``, ``colour_map="viridis"``, ``over="image"``, ``opacity=0.5``, ``zoom="nearest"``; see
+            ``PictureSettings``.
+
+        Raises
+        ------
+        UnknownName
+            There is no such token.
+        ValueError
+            A setting can't be so.
+        """
+        self._require_open()
+        self._screen.change_picture(token, settings)
+        self._screen.send_setup()
+        self._tuning.look()
+
+    @property
     def widget(self) -> Any:
         """The ipywidgets box that is shown, to be put into a layout of one's own."""
         return self._widget
@@ -251,17 +280,19 @@ class Panel(Displayed):
         return self._tuning.go_to(self._history.redo)
 
     def save(self, path: str | Path) -> Path:
-        """Write the values of all controls that can be moved to a TOML file, and return its path.
+        """Write the values of all controls that can be moved, and how pictures are shown, to a TOML file.
 
         Raises
         ------
         SettingsError
             With every reason why not.
         """
-        return settings.save(path, self._controls.movable, self._controls.params)
+        return settings.save(path, self._controls.movable, self._controls.params, self.pictures)
 
     def load(self, path: str | Path) -> None:
-        """Set the values that are in a TOML file, all or none.
+        """Set the values that are in a TOML file, all or none, and show pictures as it says.
+
+        How a token is shown that the graph does not have is passed over.
 
         Raises
         ------
@@ -270,7 +301,11 @@ class Panel(Displayed):
         ValueError
             A value is outside of its range.
         """
+        pictures, cg = settings.load_pictures(path), self._runner.cg
         self.set(**settings.load(path, {**self._runner.hyperparameters, **self.values}))
+        for token, each in pictures.items():
+            if all(map(cg.has_token, filter(None, (token, each.over)))):
+                self.show_as(token, **each.content)
 
     def write_back(self, dry_run: bool = False, timeout_s: float = 60.0) -> WriteBack:
         """Write the values of the panel into the bundle of its service, when all that was set is set there.
@@ -345,7 +380,9 @@ class Panel(Displayed):
         first = self._runner.first_hyperparameters
         image = self._session.image
         title = "" if image is None else self._session.payloads.title(image)
-        return static_html(run, self.token, run.hyperparameters, first, image=title, code=self.code())
+        return static_html(
+            run, self.token, run.hyperparameters, first, image=title, code=self.code(), limits=self._screen.shown.limits
+        )
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import count
 from typing import Any, Final
@@ -13,8 +13,9 @@ from weakref import WeakKeyDictionary
 from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
+from epypes_widgets.picture_settings import Limits, PictureSettings
 from epypes_widgets.session import Session, Tunable
-from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
+from epypes_widgets.stages import NO_STAGES, Stages, best_stage, scalars, stages, states
 from epypes_widgets.values import is_same, json_values
 from epypes_widgets.view import PictureView
 
@@ -61,6 +62,12 @@ class Shown:
         Whether the histogram of the picture is shown.
     cut
         The tokens whose histograms are shown with thresholds on them.
+    pictures
+        How pictures are shown, by the token of the image.
+    has_scalars
+        Whether the numbers that belong to the big picture are written on it.
+    scalars
+        The tokens of these numbers.
     """
 
     token: str | None = None
@@ -68,6 +75,24 @@ class Shown:
     comparison: Comparison | None = None
     has_histogram: bool = False
     cut: tuple[str, ...] = ()
+    pictures: Mapping[str, PictureSettings] = field(default_factory=dict)
+    has_scalars: bool = False
+    scalars: tuple[str, ...] = ()
+
+    def with_scalars(self, run: Run | None) -> Shown:
+        """Return it with the numbers that belong to the big picture, as far as a run shows which these are."""
+        if not self.has_scalars or self.token is None or run is None:
+            return replace(self, scalars=())
+        return replace(self, scalars=scalars(run, self.token))
+
+    def settings(self, token: str | None) -> PictureSettings:
+        """Return how the picture of a token is shown."""
+        return self.pictures.get(token or "", PictureSettings())
+
+    @property
+    def limits(self) -> Limits:
+        """The values that are shown black and white, by token, where they were set."""
+        return {token: each.limits for token, each in self.pictures.items() if each.limits is not None}
 
     @property
     def other(self) -> str:
@@ -78,7 +103,8 @@ class Shown:
     def targets(self) -> tuple[str, ...]:
         """The tokens that must be computed, the big picture's first."""
         cut = self.cut if self.has_histogram else ()
-        return tuple(dict.fromkeys(token for token in (self.token, self.other, *self.pinned, *cut) if token))
+        shown = (self.token, self.settings(self.token).over, self.other, *self.pinned, *cut, *self.scalars)
+        return tuple(dict.fromkeys(token for token in shown if token))
 
     def within(self, stages: Stages, run: Run) -> Shown:
         """Return what of this can be shown with these stages; another big picture if this one can't."""
@@ -134,7 +160,8 @@ class Screen:
     ) -> None:
         self.view = view
         before = _last_shown.get(session.runner, Shown())
-        self.shown = Shown(asked or before.token, before.pinned, has_histogram=bool(cut), cut=cut)
+        first = replace(before, token=asked or before.token, comparison=None, has_histogram=bool(cut), cut=cut)
+        self.shown = first.with_scalars(session.result)
         self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
@@ -156,7 +183,16 @@ class Screen:
     def change(self, **parts: Any) -> None:
         """Replace parts of what is shown."""
         with self._lock:
-            self.shown = _last_shown[self._session.runner] = replace(self.shown, **parts)
+            shown = replace(self.shown, **parts).with_scalars(self._session.result)
+            self.shown = _last_shown[self._session.runner] = shown
+
+    def change_picture(self, token: str, change: Mapping[str, Any]) -> None:
+        """Change how the picture of a token is shown; ValueError or UnknownName if it can't be shown so."""
+        cg = self._session.runner.cg
+        for name in filter(None, (token, change.get("over"))):
+            cg.require_token(name)
+        changed = PictureSettings.of({**self.shown.settings(token).content, **change})
+        self.change(pictures={**self.shown.pictures, token: changed})
 
     def require_stage(self, token: str) -> str:
         """Return the token; LookupError if it is no stage."""
@@ -171,7 +207,7 @@ class Screen:
         found = stages(run, self.stages, self._asked)
         with self._lock:
             is_new, self.stages = found != self.stages, found
-            self.shown = self.shown.within(found, run)
+            self.shown = self.shown.within(found, run).with_scalars(run)
         if is_new:
             self.send_setup()
 
@@ -223,7 +259,7 @@ class Screen:
     def refer(self, key: object, payload: Sequence[Any], label: str, run: Run, token: str) -> None:
         """Show a token of another run to compare with."""
         self._referred = key, tuple(payload)
-        described, data = picture(run, token, "other", had_pictures=self._pictures)
+        described, data = picture(run, token, "other", had_pictures=self._pictures, limits=self.shown.limits)
         content = {"seq": self._seq(), "label": label, "picture": described}
         self.tell("reference", content, (data,) if data else ())
 
@@ -263,6 +299,8 @@ class Screen:
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
+            "scalars": shown.has_scalars,
+            "pictures": {token: each.content for token, each in shown.pictures.items()},
             "closed": self._is_closed,
         }
         self.view.tell("setup", setup, buffers)

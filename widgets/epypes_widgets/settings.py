@@ -16,12 +16,14 @@ from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
 from epypes.hints import Param
 from epypes.optional import optional_import
+from epypes_widgets.picture_settings import PictureSettings
 from epypes_widgets.ranges import range_text
 from epypes_widgets.values import numpy_type
 
 FORMAT: Final = "epypes settings 1"
 _SUFFIX: Final = ".toml"
 _SECTION: Final = "hyperparameters"
+_PICTURES: Final = "pictures"
 _ABOUT: Final = "Values of hyperparameters, saved by a panel of EPypes. They may be edited; the rest may not."
 _COMMENT_CHARACTERS: Final = 80
 # A longer file, or more reasons, are no settings that a panel has saved.
@@ -30,7 +32,12 @@ _MAX_REASONS: Final = 20
 _MEMBER: Final = "enum"
 
 
-def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, object] | None = None) -> Path:
+def save(
+    path: str | Path,
+    values: Mapping[str, Any],
+    params: Mapping[str, object] | None = None,
+    pictures: Mapping[str, PictureSettings] | None = None,
+) -> Path:
     """Write values as TOML, in one step: a file that was there is whole at every moment.
 
     Parameters
@@ -41,6 +48,8 @@ def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, objec
         By hyperparameter.
     params
         By hyperparameter, the ranges and units that stand beside the values.
+    pictures
+        By token, how its picture is shown; only what is not as at first is written.
 
     Returns
     -------
@@ -56,7 +65,7 @@ def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, objec
     reasons = [reason for token, value in values.items() for reason in _unwritable(token, value)]
     if reasons:
         raise SettingsError(file, reasons)
-    text = _document(values, params or {})
+    text = _document(values, params or {}, pictures or {})
     try:
         if file.is_file() and not _is_ours(file):
             raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
@@ -96,6 +105,21 @@ def load(path: str | Path, present: Mapping[str, Any]) -> dict[str, Any]:
     if reasons:
         raise SettingsError(file, reasons[:_MAX_REASONS])
     return values
+
+
+def load_pictures(path: str | Path) -> dict[str, PictureSettings]:
+    """Return how pictures are shown, by token, as a file has it; SettingsError with every reason why not."""
+    file = _with_suffix(path)
+    found, reasons = {}, []
+    sections = _read(file).get(_PICTURES, {})
+    for token, section in sections.items() if isinstance(sections, dict) else ():
+        try:
+            found[token] = PictureSettings.of(section if isinstance(section, dict) else {"": section})
+        except ValueError as error:
+            reasons.append(f"[{_PICTURES}.{token}]: {error}")
+    if reasons:
+        raise SettingsError(file, reasons[:_MAX_REASONS])
+    return found
 
 
 def names(folder: str | Path) -> tuple[str, ...]:
@@ -144,7 +168,7 @@ def _unwritable(token: str, value: Any) -> Iterator[str]:
         )
 
 
-def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
+def _document(values: Mapping[str, Any], params: Mapping[str, object], pictures: Mapping[str, PictureSettings]) -> str:
     with optional_import("widgets"):
         import tomlkit
 
@@ -163,6 +187,8 @@ def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
             item.comment(comment)
         table.add(token, item)
     document.add(_SECTION, table)
+    if any(each.changed for each in pictures.values()):
+        document.add(_PICTURES, tomlkit.item({token: each.changed for token, each in pictures.items() if each.changed}))
     return tomlkit.dumps(document)
 
 
@@ -186,12 +212,12 @@ def _replace(file: Path, text: str) -> None:
 # -- reading ----------------------------------------------------------------------------------------------------
 
 
-def _entries(file: Path) -> dict[str, Any]:
+def _read(file: Path) -> dict[str, Any]:
     try:
         found = file.stat()
         if not stat.S_ISDIR(found.st_mode) and not (stat.S_ISREG(found.st_mode) and found.st_size <= _MAX_BYTES):
             raise SettingsError(file, [f"{file} is no plain file of at most {_MAX_BYTES / 1e6:g} MB."])
-        document = tomllib.loads(file.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         folder = "in this folder" if file.parent == Path() else f"in {file.parent.resolve()}"
         unknown = UnknownName("settings", file.name.removesuffix(_SUFFIX), names(file.parent), folder)
@@ -200,6 +226,10 @@ def _entries(file: Path) -> dict[str, Any]:
         raise SettingsError(file, [f"{file} is not TOML: {error}."]) from error
     except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text, and a zero byte in the name
         raise SettingsError(file, [f"{file} can't be read: {error}."]) from error
+
+
+def _entries(file: Path) -> dict[str, Any]:
+    document = _read(file)
     entries = document.get(_SECTION)
     if document.get("format") != FORMAT or not isinstance(entries, dict):
         found_format = document.get("format", "no format")

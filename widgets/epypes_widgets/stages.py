@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
-from epypes.display import Scene, is_image, scene_of
+from epypes.display import Scene, is_image, scalar_owners, scene_of
 from epypes.display.previews.arrays import is_strip, plain_array
 from epypes.display.previews.images import image_kind, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
@@ -110,6 +110,16 @@ def _has_picture(run: Run, token: str) -> bool:
 def _value(run: Run, token: str) -> Any:
     """Return a token's value even if it is stale; what stands for none of a token that was not computed."""
     return run.tokens.values[run.tokens.program.slots[token]]
+
+
+# -- numbers of a picture ---------------------------------------------------------------------------------------------
+
+
+def scalars(run: Run, token: str) -> tuple[str, ...]:
+    """Return the numbers and short texts that belong to a picture: to the stage, or to what it is drawn over."""
+    scene, owners = scene_of(run, token, had_marks=True), scalar_owners(run)
+    images = {token, scene.backdrop.name} if scene is not None else {token}
+    return tuple(name for name, image in owners.items() if image in images)
 
 
 # -- at a pixel -------------------------------------------------------------------------------------------------------

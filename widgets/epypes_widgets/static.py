@@ -19,6 +19,7 @@ from epypes.errors import NotComputed
 from epypes.graph import colour_order
 from epypes.run import Run
 from epypes_widgets.frames import still_picture
+from epypes_widgets.picture_settings import NO_LIMITS, Limits
 from epypes_widgets.values import differing, short_text
 
 # In a page a picture is a third longer. Together with 40 rows of 420 characters it stays below 120 kB.
@@ -104,6 +105,7 @@ def static_html(
     *,
     image: str = "",
     code: str = "",
+    limits: Limits = NO_LIMITS,
 ) -> str:
     """Return one ``<figure class="epypes-static">`` of less than 120 kB: the picture of a token, and the values.
 
@@ -121,16 +123,18 @@ def static_html(
         The title of the image that it was computed on; may be empty.
     code
         The equivalent code line; may be empty, and is left out if it is very long.
+    limits
+        By token, the values that are shown black and white where the user has set them.
     """
     on = f" of {cut(image, _NAME_CHARACTERS)}" if image else ""
-    picture = _shown(run, token, on) if token is not None else ""
+    picture = _shown(run, token, on, limits) if token is not None else ""
     # Half a line of code is worse than none: the table has the values.
     fits = code and written_length(code) <= _TEXT_ROOM
     line = f'<pre style="white-space:pre-wrap;font-family:monospace">{content(code)}</pre>' if fits else ""
     return f'<figure class="epypes-static" style="margin:0">{picture}{_table(values, defaults)}{line}</figure>'
 
 
-def _shown(run: Run, token: str, on: str) -> str:
+def _shown(run: Run, token: str, on: str, limits: Limits) -> str:
     name = cut(token, _NAME_CHARACTERS)
     try:
         value = run[token]
@@ -138,7 +142,7 @@ def _shown(run: Run, token: str, on: str) -> str:
         return _caption(f"{name}{on}: {cut(str(error), 200)}")
     look = Look(colour_order(run.cg, token))
     about = f"{name}{on}: {sketch(value, look).shown.detail}"
-    picture = still_picture(run, token, _PICTURE_SIDE_PX, _PICTURE_BYTES)
+    picture = still_picture(run, token, _PICTURE_SIDE_PX, _PICTURE_BYTES, limits)
     if picture is None:
         return _caption(about)
     data = base64.b64encode(picture.data).decode()

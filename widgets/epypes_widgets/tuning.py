@@ -372,7 +372,7 @@ class Tuning:
         if not len(self.session.payloads) and current is not None:
             image = current.image  # that of another panel on this runner
         token = self.screen.shown.token
-        about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms}
+        about = {"picture": thumbnail(run, token, self.screen.shown.limits), "compute_ms": self.screen.compute_ms}
         self.history.commit(run.hyperparameters, image=image, token=token, **about)
 
     def _compare(self) -> None:
@@ -382,7 +382,8 @@ class Tuning:
             self.screen.refer_anew(to_nothing=True)
             return
         payload = self.session.payload
-        if self.screen.refers_to((comparison, token), payload):
+        key = comparison, token, self.screen.shown.limits
+        if self.screen.refers_to(key, payload):
             return
         try:
             values, label = self._compared(comparison)
@@ -397,7 +398,7 @@ class Tuning:
         if run.failure is not None:
             self.screen.log(f"Nothing to compare with: with these values {run.failure}.")
         else:
-            self.screen.refer((comparison, token), payload, label, run, token)
+            self.screen.refer(key, payload, label, run, token)
 
     def _compared(self, comparison: Comparison) -> tuple[Mapping[str, Any], str]:
         if comparison.kind == "default":

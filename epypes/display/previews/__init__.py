@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from epypes.display.previews.images import Range, display_range
+from epypes.display.previews.images import ImageKind, Range, display_range
 from epypes.images import Order
 from epypes.optional import LazyModule
 
@@ -40,12 +40,15 @@ class Picture:
         ``"image/jpeg"`` or ``"image/png"``.
     width, height
         Its size, in pixels.
+    kind
+        What the image was seen as.
     """
 
     data: bytes = field(repr=False)
     media_type: str
     width: int
     height: int
+    kind: ImageKind = "photograph"
 
     @property
     def uri(self) -> str:
@@ -152,6 +155,8 @@ class Marks:
         How many points or lines there are; fewer may be drawn.
     extents
         (n, 2) of the points' diameter in pixels and angle in degrees, as keypoints have them; None if they have none.
+    are_circles
+        Whether what was found are circles of these diameters, not points.
     """
 
     points: Floats
@@ -159,6 +164,7 @@ class Marks:
     are_closed: bool = False
     total: int = 0
     extents: Floats | None = None
+    are_circles: bool = False
 
     @property
     def drawn(self) -> int:
@@ -200,7 +206,13 @@ class Most(NamedTuple):
 
 
 class Surroundings:
-    """The images of a value's graph that it is seen with; a value that stands alone has none."""
+    """The images of a value's graph that it is seen with, and its names; a value that stands alone has none."""
+
+    name = ""
+
+    def maker_names(self) -> frozenset[str]:
+        """Return the names in the code of the function that made the value, as ``"boundingRect"``."""
+        return frozenset()
 
     def range_of(self, image: Any) -> Range:
         """Return which values are shown black and white, if the value is an image."""

@@ -6,13 +6,23 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews import THUMBNAIL_PX, Backdrop, Look, Preview, Scene, Sketch
-from epypes.display.previews.drawing import bar_chart, line_chart, point_sketch, quad_sketch, segment_sketch
+from epypes.display.previews.drawing import bar_chart, line_chart
 from epypes.display.previews.encoding import encode_small, is_pooled, pillow_image
+from epypes.display.previews.features import (
+    circle_sketch,
+    flow_sketch,
+    has_flow_shape,
+    point_sketch,
+    quad_sketch,
+    says_circles,
+    segment_sketch,
+)
 from epypes.display.previews.images import (
     few_of,
     image_kind,
     is_image,
     is_of_dtype,
+    label_areas,
     label_text,
     one_channel,
     sampled,
@@ -22,7 +32,7 @@ from epypes.display.previews.images import (
 from epypes.display.previews.introspection import is_of
 from epypes.display.previews.objects import record_sketch
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
-from epypes.display.text import cut
+from epypes.display.text import cut, memory_text
 from epypes.optional import LazyModule
 
 if TYPE_CHECKING:
@@ -64,7 +74,7 @@ def array_sketch(array: Any, look: Look) -> Sketch | Preview:
         return record_sketch(array)
     if array.dtype.kind not in "biuf" or not array.size:
         return _plain(array)
-    closer = _closer(array)
+    closer = _closer(array, look)
     if closer is None:
         return _plain(array)
     text = array_text(array) + _order_text(array, look) * (closer is image_sketch)
@@ -73,14 +83,23 @@ def array_sketch(array: Any, look: Look) -> Sketch | Preview:
     return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
 
 
-def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
+def _closer(array: Array, look: Look) -> Callable[[Array, Look], Sketch | None] | None:
     """Return what draws an array of its shape; None if nothing can be drawn."""
     if is_image(array) and not is_strip(array):
         return image_sketch
     if array.shape[1:] in _PLACES:
         return _places
+    if has_flow_shape(array):
+        return flow_sketch
+    is_of_hough = array.ndim == 3 and array.dtype.str[1:] == "f4"
+    if _has_circle_shape(array) and (is_of_hough or says_circles(look)):
+        return circle_sketch
     is_line = array.size == max(array.shape) > _SMALL_SIDE
     return _drawn_numbers if is_line else None
+
+
+def _has_circle_shape(array: Array) -> bool:
+    return array.shape[-1] == 3 and array.dtype.itemsize > 1 and (array.ndim == 2 or array.shape[:-2] == (1,))
 
 
 def is_strip(array: Array) -> bool:
@@ -97,7 +116,9 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     text = array_text(array) + _order_text(array, look)
     detail, note = [text, statistics_text(sample, array)], ""
     if kind == "labels":
-        detail.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
+        # Labels are names: their range and mean say nothing.
+        areas = label_areas(one_channel(sample), array.size)
+        detail[1:] = [label_text(areas, is_sample=sample is not array), memory_text(array.nbytes)]
     elif kind == "mask":
         detail.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
     elif not is_of_dtype(array.dtype, ends):

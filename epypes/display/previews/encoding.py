@@ -13,6 +13,7 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
@@ -34,6 +35,7 @@ JPEG_QUALITY: Final = 80
 _QUALITIES: Final = (68, 55, 42)
 _COLOURS: Final = 48
 _LEAST_SIDE_PX: Final = 16
+_MOST_LEVELS: Final = 2**16
 
 
 def encode_image(
@@ -67,9 +69,9 @@ def encode_image(
             kind = "photograph"
         if kind == "mask" and most_bytes is None and not _is_thumbnail(array, max_side_px):
             bits = _mask_bits(one_channel(array), max_side_px)
-            return Picture(bitmap_png(bits), "image/png", bits.shape[1], bits.shape[0])
+            return Picture(bitmap_png(bits), "image/png", bits.shape[1], bits.shape[0], kind)
         picture = pillow_image(array, max_side_px, order, ends, kind)
-        return _save(picture) if most_bytes is None else encode_small(picture, most_bytes)
+        return replace(_save(picture) if most_bytes is None else encode_small(picture, most_bytes), kind=kind)
 
 
 def pillow_image(array: Array, max_side_px: int | None, order: Order, ends: Range | None, kind: str) -> Image.Image:
@@ -127,6 +129,10 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
     if image.dtype == np.uint16 and low == 0.0 and high >= 255.0 and (int(high) & (int(high) + 1)) == 0:
         bits = int(high).bit_length()
         return np.ascontiguousarray(np.right_shift(np.minimum(image, np.uint16(high)), bits - 8), dtype=np.uint8)
+    levels = 2 ** (8 * image.dtype.itemsize)
+    if image.dtype.kind == "u" and levels <= _MOST_LEVELS and image.size > levels:
+        # Of each level once: a photograph has many more pixels.
+        return _as_bytes(np.arange(levels, dtype=image.dtype), ends)[image]
     is_wide = image.dtype.itemsize > 4 or (image.dtype.kind in "iu" and image.dtype.itemsize == 4)
     values: npt.NDArray[np.floating[Any]] = image.astype(np.float64 if is_wide else np.float32)
     # Halves, since the two ends may be further apart than the largest float.

@@ -255,9 +255,19 @@ def _text(value: Any) -> str:
     return f"{value:.6g}" if value.dtype.kind == "f" else str(value)
 
 
-def label_text(sample: Array) -> str:
-    """Return how many labels there are besides 0."""
-    positive = sample[sample > 0]
-    is_narrow = positive.size > 0 and int(positive.max()) <= 10 * sample.size
-    count = int(np.count_nonzero(np.bincount(positive))) if is_narrow else len(np.unique(positive))
-    return counted(count, "label")
+def label_areas(labels: Array, pixels: int) -> Array:
+    """Return how many pixels each label besides 0 has, the largest first; a sample stands for so many pixels in all."""
+    positive = labels[labels > 0]
+    is_narrow = positive.size > 0 and int(positive.max()) <= 10 * labels.size
+    counts = np.bincount(positive) if is_narrow else np.unique(positive, return_counts=True)[1]
+    areas = np.sort(counts[counts > 0])[::-1]
+    return areas if labels.size == pixels else np.rint(areas * (pixels / labels.size)).astype(np.int64)
+
+
+def label_text(areas: Array, *, is_sample: bool = False) -> str:
+    """Return how many labels there are, and how large they are."""
+    text = counted(len(areas), "label")
+    if not len(areas):
+        return text
+    sizes = f"{areas[-1]} to {areas[0]} px, median {np.median(areas):.6g} px" if len(areas) > 1 else f"{areas[0]} px"
+    return f"{text} of {'about ' * is_sample}{sizes}{' in a sample' * is_sample}"

@@ -10,7 +10,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from epypes.display.previews import Look, Preview, Sketch
-from epypes.display.previews.drawing import bar_chart, list_sketch
+from epypes.display.previews.drawing import bar_chart
+from epypes.display.previews.features import list_sketch
 from epypes.display.previews.images import some_of, statistics_text
 from epypes.display.previews.introspection import fields_of, is_of, items_in, kind_name, length_of, pairs_in, stored
 from epypes.display.previews.short import float_text, reason, row_texts, short_repr, shown_items

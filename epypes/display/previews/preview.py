@@ -54,7 +54,7 @@ else:
     Image = LazyModule("PIL.Image")
 
 _TEXT_CHARACTERS: Final = 30
-_DETAIL_CHARACTERS: Final = 290
+DETAIL_CHARACTERS: Final = 290
 _ROW_CHARACTERS: Final = 60
 _MOST_ROWS: Final = 4
 _CHARTS: Final = ("line", "bars", "points")
@@ -236,7 +236,7 @@ def _limited(found: Sketch | Preview) -> Sketch:
 def _failed(shown: Preview, what: str, error: Exception) -> Preview:
     message = f"{what}: {reason(error)}"
     text = shown.text or cut(message, _TEXT_CHARACTERS)
-    return replace(shown, text=text, detail=cut(f"{shown.detail}, {message}", _DETAIL_CHARACTERS))
+    return replace(shown, text=text, detail=cut(f"{shown.detail}, {message}", DETAIL_CHARACTERS))
 
 
 def _kind(value: Any) -> str:
@@ -258,7 +258,7 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
             return replace(arrays.image_sketch(arrays.plain_array(found.picture), look), shown=shown, is_image=False)
         return Sketch(shown, _drawing(found.picture, found.chart))
     if issubclass(kind, str):
-        return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {plain_text(found)[:_DETAIL_CHARACTERS]}")))
+        return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {plain_text(found)[:DETAIL_CHARACTERS]}")))
     if is_image(found):
         image = arrays.image_sketch(arrays.plain_array(found), look)
         detail = f"{_kind(value)}, shown as {image.shown.detail}"
@@ -276,7 +276,7 @@ def _trimmed(shown: Preview) -> Preview:
     text = cut(plain_text(shown.text)[:500], _TEXT_CHARACTERS)
     short = [plain_text(row)[:_ROW_CHARACTERS] for row in rows]
     lines = ["".join(mark if mark.isprintable() else " " for mark in row) for row in short]
-    detail = cut(plain_text(shown.detail)[:1000], _DETAIL_CHARACTERS)
+    detail = cut(plain_text(shown.detail)[:1000], DETAIL_CHARACTERS)
     return Preview(text or "(empty text)", detail, shown.picture, shown.chart, tuple(lines))
 
 

@@ -12,16 +12,19 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
+from operator import itemgetter
+from types import CodeType
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews import Backdrop, Look, Most, Scene, Surroundings
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.drawing import are_keypoints, no_marks
+from epypes.display.previews.features import are_keypoints, no_marks
 from epypes.display.previews.images import Range, display_range, image_kind, is_image, own_range, sampled
-from epypes.display.previews.introspection import kind_name
+from epypes.display.previews.introspection import is_of, kind_name
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
+from epypes.graph.identity import innermost
 from epypes.run import CompGraphRunner, Run
 from epypes.run.program import Program
 
@@ -55,19 +58,23 @@ def _kept_range(program: Program, token: str, image: Array) -> Range:
     return ranges.setdefault(key, found)
 
 
-def reset_display_ranges(shown: Any) -> None:
+def reset_display_ranges(shown: Any, token: str | None = None) -> None:
     """Forget which values are shown black and white; those of the next images are kept instead.
 
     Parameters
     ----------
     shown
-        A runner, a run or a pipeline; of all its tokens.
+        A runner, a run or a pipeline.
+    token
+        Of which token; without, of all.
     """
     runner = getattr(shown, "runner", shown)
     run = runner.last if isinstance(runner, CompGraphRunner) else runner
     if isinstance(run, Run):
         with _lock:
-            _ranges.pop(run.tokens.program, None)
+            kept = _ranges.pop(run.tokens.program, {})
+            if token is not None:
+                _ranges[run.tokens.program] = {key: ends for key, ends in kept.items() if key[0] != token}
     elif not isinstance(runner, CompGraphRunner):
         raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
 
@@ -90,6 +97,14 @@ class RunSurroundings(Surroundings):
 
     def __init__(self, run: Run, token: str, *, keeps_ranges: bool = True) -> None:
         self._run, self._token, self._keeps_ranges = run, token, keeps_ranges
+        self.name = token
+
+    def maker_names(self) -> frozenset[str]:
+        """Return the name of the function that made the token, and those in its code."""
+        maker = self._run.cg.digraph.producer.get(self._token)
+        if maker is None:
+            return frozenset()
+        return _names_in(getattr(innermost(self._run.cg.functions[maker]), "__code__", None)) | {maker}
 
     def range_of(self, image: Any, token: str = "") -> Range:
         """Return which values of a token's image are black and white; without one, of this token's."""
@@ -180,6 +195,45 @@ class RunSurroundings(Surroundings):
         return Backdrop(value, colour_order(self._run.cg, token), self.range_of(value, token), token)
 
 
+_SCALAR_CHARACTERS: Final = 40
+
+
+def scalar_owners(run: Run) -> dict[str, str]:
+    """Return the image that each number or short text of a run belongs to, by token, in graph order.
+
+    It belongs to the nearest of the images that it was made from; one that was made from none is left out. Values that
+    are out of date count, too.
+    """
+    graph, values = run.cg.digraph, dict(zip(run.tokens.program.tokens, run.tokens.values, strict=True))
+    scalars = [name for name in run.cg.tokens if name in graph.producer and _is_scalar(values[name])]
+    if not scalars:
+        return {}
+    images = {name for name, value in values.items() if is_image(value)}
+    # By token the image, and how many functions lie between.
+    nearest = {name: (0, name) for name in images}
+    for function in run.cg.functions:
+        found = [nearest[name] for name in graph.inputs[function] if name in nearest]
+        if found:
+            distance, image = min(found, key=itemgetter(0))
+            for name in graph.outputs[function]:
+                nearest.setdefault(name, (distance + 1, image))
+    return {name: nearest[name][1] for name in scalars if name in nearest}
+
+
+def _is_scalar(value: Any) -> bool:
+    kind = type(value)
+    is_text = kind is str and len(value) <= _SCALAR_CHARACTERS
+    # Most values are arrays, which are known at a glance.
+    return kind in (bool, int, float) or is_text or (kind.__name__ != "ndarray" and is_of(value, "numpy", "generic"))
+
+
+def _names_in(code: object) -> frozenset[str]:
+    """Return the names that code uses, that of its comprehensions and inner functions included."""
+    if type(code) is not CodeType:
+        return frozenset()
+    return frozenset(code.co_names).union(*map(_names_in, code.co_consts))
+
+
 def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:
     """Return a token as an image, and its marks if it is what was found in one; never raises for a value.
 
@@ -188,7 +242,8 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
     run
         Its tokens' values.
     token
-        An image, what a preview function shows as an image, or keypoints, contours, boxes, segments, points, matches.
+        An image, what a preview function shows as an image, or keypoints, contours, boxes, circles, segments, points,
+        matches, optical flow.
     most
         How many marks there are at most; without, as many as on a thumbnail.
     had_marks

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from weakref import WeakKeyDictionary, ref
 
 from epypes.display.previews import THUMBNAIL_BYTES, Look, Preview, Sketch
 from epypes.display.previews.images import Range
 from epypes.display.previews.introspection import is_in_users_code
-from epypes.display.previews.preview import finished, is_shown_by_user, sketch, users_functions
-from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
+from epypes.display.previews.preview import DETAIL_CHARACTERS, finished, is_shown_by_user, sketch, users_functions
+from epypes.display.text import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS, cut
 from epypes.display.views.graphview import GraphView, TokenState, TokenView
-from epypes.display.views.surroundings import RunSurroundings
+from epypes.display.views.surroundings import RunSurroundings, scalar_owners
 from epypes.nothing import NothingType
 from epypes.optional import LazyModule
 from epypes.run import Run
@@ -177,6 +178,8 @@ def token_views(
             look = Look(token.order) if run is None else Look(token.order, RunSurroundings(run, name))
             found[name] = _find(kept, (name, False), values[name], look)
     previews, dropped = _with_thumbnails(found, _rank(run, found, targets), room)
+    if run is not None:
+        _name_scalars(run, previews)
     first = _first_texts(structure, hparams, kept)
     for each in found.values():
         each.shown.sketch = None
@@ -206,6 +209,15 @@ def _rank(run: Run | None, found: Mapping[str, _Found], targets: Collection[str]
         return token not in targets, place
 
     return rank
+
+
+def _name_scalars(run: Run, previews: dict[str, Preview]) -> None:
+    """Say with each image which numbers were made from it."""
+    for name, image in scalar_owners(run).items():
+        if image in previews and name in previews and not run.tokens.is_stale(name):
+            shown = previews[image]
+            detail = cut(f"{shown.detail}, {name} = {previews[name].text}", DETAIL_CHARACTERS)
+            previews[image] = replace(shown, detail=detail)
 
 
 def _first_texts(structure: GraphView, hparams: HyperparameterValues, kept: _Kept) -> dict[str, str]:

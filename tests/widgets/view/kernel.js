@@ -137,6 +137,8 @@ async function bytesOf(token, width = SIZE.width) {
 const pictureOf = (token, role, width = SIZE.width) => ({
   token, role, media_type: "image/jpeg", width, height: Math.round((width * SIZE.height) / SIZE.width),
   full_width: SIZE.width, full_height: SIZE.height, shape: `${SIZE.height} x ${SIZE.width}`, dtype: "uint8", overlay: null,
+  image: token, kind: kernel.masks.includes(token) ? "mask" : "photograph", order: token === "image" ? "bgr, assumed" : "", range: [0, 255], limits: kernel.pictures[token]?.limits ?? [0, 255],
+  ...(kernel.masks.includes(token) && role === "main" ? { beneath: ["image", "gray", "blurred"] } : {}),
 });
 
 function histogram(names = ["gray"]) {
@@ -149,7 +151,7 @@ const kernel = {
   sent: [], values: structuredClone(DEFAULTS), token: "edges", pinned: [], seq: 0, isHistogramOn: false, compared: null, live: true,
   overlay: null, isQuiet: false, entries: [{ number: 0, values: {}, label: "#0", changed: "", current: true }], image: 0, video: null,
   defaults: DEFAULTS, bytesOf, pictureOf, histogram, size: SIZE,
-  listeners: new Set(),
+  listeners: new Set(), pictures: {}, masks: [],
   models: {},
   kinds: (kind) => kernel.sent.filter((one) => one.kind === kind),
   deliver: (message, buffers = []) => kernel.listeners.forEach((listener) => listener(message, buffers)),
@@ -171,6 +173,11 @@ const kernel = {
     for (const token of kernel.pinned) {
       message.pictures.push(pictureOf(token, "pinned", 160));
       buffers.push(await bytesOf(token, 160));
+    }
+    const over = kernel.pictures[kernel.token]?.over;
+    if (over) {
+      message.pictures.push(pictureOf(over, "under"));
+      buffers.push(await bytesOf(over));
     }
     if (kernel.compared?.kind === "stage") {
       message.pictures.push(pictureOf(kernel.compared.token, "other"));
@@ -224,7 +231,7 @@ const answers = {
     kernel.deliver({
       kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images,
       video: kernel.video, live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
-      promote_to: "services/edges", settings: ["good", "dark"], token: kernel.token, pinned: [], closed: false,
+      promote_to: "services/edges", settings: ["good", "dark"], token: kernel.token, pinned: [], closed: false, pictures: structuredClone(kernel.pictures),
     }, [await bytesOf("image", 96), await bytesOf("gray", 96)]);
     await kernel.remember();
     await kernel.run();
@@ -257,6 +264,11 @@ const answers = {
   async pin({ token, on }) { kernel.pinned = on ? [...kernel.pinned, token] : kernel.pinned.filter((one) => one !== token); await kernel.run(); },
   async histogram({ on }) { kernel.isHistogramOn = on; await kernel.run(); },
   async image({ index }) { kernel.image = index; await kernel.run(); },
+  async picture({ token, change }) {
+    const limits = "limits" in change ? { limits: change.limits === "auto" ? [20, 180] : change.limits ?? undefined } : {};
+    kernel.pictures[token] = { ...kernel.pictures[token], ...change, ...limits };
+    if ("limits" in change || "over" in change) await kernel.run();
+  },
   async compare(message) {
     kernel.compared = message.with;
     if (message.with?.kind === "stage") return kernel.run();
@@ -274,6 +286,8 @@ const answers = {
     setTimeout(() => kernel.deliver({ kind: "promoted", state: "done", text: `3 functions written to ${to}; replayed, same values`, to }), 30);
   },
 };
+
+kernel.answers = answers;
 
 const model = {
   send(content) {

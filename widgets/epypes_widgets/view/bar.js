@@ -4,7 +4,7 @@ import { ARROWS, consume, element, iconButton, note, say, textButton } from "./e
 
 const TYPED_IN = "input, select, textarea";
 
-export function barPart(panel, { stage, compare, histogram, probe, roi }) {
+export function barPart(panel, { stage, compare, pictures, histogram, probe, roi }) {
   const group = (label, ...children) => element("span", "epypes-group", { role: "group", "aria-label": label }, ...children);
   const asking = (icon, label, message, name) => iconButton(icon, label, () => panel.send(message), name);
   const escape = () => {
@@ -36,10 +36,12 @@ export function barPart(panel, { stage, compare, histogram, probe, roi }) {
   isOnOf.set(flip, () => compare.isFlipped);
   const wipe = toggling("wipe", "Wipe between the two pictures (w)", "w", () => compare.mode === "wipe", () => compare.toggle("wipe"), "epypes-wipe");
   const side = toggling("side", "Side by side (s)", "s", () => compare.mode === "side", () => compare.toggle("side"), "epypes-side-button");
+  const look = toggling("contrast", "Contrast, colours, what it lies over (c)", "c", () => pictures.isOn, () => pictures.toggle(), "epypes-look-button");
   const bars = toggling("histogram", "Histogram (h)", "h", () => histogram.isOn, () => histogram.toggle(), "epypes-histogram-button");
   const log = toggling("log", "Logarithmic counts (l)", "l", () => histogram.isLogarithmic, () => histogram.toggleLog());
   const hidden = "epypes-without-marks";
   const marks = toggling("marks", "Marks on the picture (o)", "o", () => !stage.box.classList.contains(hidden), () => stage.box.classList.toggle(hidden));
+  const numbers = toggling("numbers", "Numbers of the picture on it (n)", "n", () => pictures.hasNumbers, () => pictures.toggleNumbers(), "epypes-numbers-button");
   const probed = toggling("probe", "Values of the pixel under the pointer (p: by keys)", "", () => probe.isOn, () => probe.toggle());
   const draw = toggling("roi", "Draw a rectangle (r)", "r", () => roi.isDrawing, () => roi.toggle(), "epypes-roi-button");
   const root = element(
@@ -50,7 +52,7 @@ export function barPart(panel, { stage, compare, histogram, probe, roi }) {
     group("History", undo, redo, reset),
     group("Zoom", iconButton("minus", "Zoom out (-)", stage.zoomOut), scale, iconButton("plus", "Zoom in (+)", stage.zoomIn), iconButton("fit", "Fit (0)", stage.fit, "epypes-fit")),
     group("Compare", select, flip, wipe, side),
-    group("Look", bars, log, marks, probed, draw),
+    group("Look", look, bars, log, marks, numbers, probed, draw),
   );
   let isLive = true;
   let isClosed = false;

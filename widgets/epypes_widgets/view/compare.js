@@ -102,6 +102,7 @@ export function comparePart(panel, stage) {
       if (!(await swap(stage.other, bytes, picture.media_type))) return;
       if (asked !== target) return choose(target);
       drawOverlay(stage.otherMarks, picture.overlay);
+      panel.dress(stage.other, picture, stage.otherUnder.hasAttribute("src") && picture.token === panel.state.token);
       stage.other.alt = `${picture.token}, compared with: ${reference || label}`;
       stage.other.dataset.seq = String(seq);
       isThere = true;

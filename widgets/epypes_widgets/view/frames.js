@@ -71,8 +71,17 @@ export function framesPart(panel, stage, failed) {
     stage.canvas.hidden = node === stage.text;
   }
 
-  async function showPicture(frame, { picture, bytes }) {
-    if (!(await swap(stage.picture, bytes, picture.media_type))) throw new Error(`its bytes are no ${picture.media_type}`);
+  async function showPicture(frame, { picture, bytes }, under) {
+    // What it is compared with lies over the same image.
+    const beneath = under?.bytes ? [stage.under, ...(panel.compare.target ? [stage.otherUnder] : [])] : [];
+    const swaps = [swap(stage.picture, bytes, picture.media_type), ...beneath.map((img) => swap(img, under.bytes, under.picture.media_type))];
+    if (!(await swaps[0])) throw new Error(`its bytes are no ${picture.media_type}`);
+    await Promise.all(swaps);
+    for (const img of [stage.under, stage.otherUnder]) {
+      if (beneath.includes(img)) panel.dress(img, under.picture);
+      else clear(img);
+    }
+    panel.dress(stage.picture, picture, beneath.length > 0);
     const values = Object.entries(frame.values).map(([name, value]) => `${name} ${typeof value === "number" ? written(value) : value}`);
     stage.picture.alt = `${frame.token}${values.length ? ` with ${values.join(", ")}` : ""}`;
     stage.picture.hidden = false;
@@ -88,12 +97,13 @@ export function framesPart(panel, stage, failed) {
     const shown = withBytes(frame.pictures, buffers);
     const main = shown.find(({ picture }) => picture.role === "main") ?? shown[0];
     const other = shown.find(({ picture }) => picture.role === "other");
+    const under = shown.find(({ picture }) => picture.role === "under");
     try {
       const compared = other && panel.compare.take(other.picture, other.bytes, frame.seq);
       if (main.picture.media_type === "text/plain") {
         stage.text.textContent = main.picture.text ?? "";
         mark(stage.text, frame);
-      } else await showPicture(frame, main);
+      } else await showPicture(frame, main, under);
       await compared;
       failed.paint(frame);
       panel.describe({ frame, main: main.picture, shown });

@@ -118,22 +118,23 @@ export function histogramPart(panel) {
   function paint(token, histogram) {
     if (!charts.has(token)) charts.set(token, make(token));
     const chart = charts.get(token);
-    const { low, high, channels, sampled } = histogram;
+    const { low, high, channels, sampled, labels } = histogram;
     chart.histogram = histogram;
     const most = fullest(histogram);
     chart.bars.replaceChildren(
       ...channels.map(({ name, counts }) => shape("path", { class: `epypes-channel epypes-channel-${name}`, d: outline(counts, most, isLogarithmic) })),
     );
-    say(chart.low, shortly(low));
-    say(chart.high, shortly(high));
+    for (const [node, end] of [[chart.low, low], [chart.high, high]]) say(node, labels ? "" : shortly(Number(end.toPrecision(6))));
     const names = channels.length > 1 ? ` ${channels.map((one) => one.name).join(" ")}` : "";
-    say(chart.title, `${token}${names}${sampled ? ", sampled" : ""}${isLogarithmic ? ", log counts" : ""}`);
-    note(chart.svg, "aria-label", `Histogram of ${token} from ${shortly(low)} to ${shortly(high)}`);
+    const about = labels ? `: ${labels}` : `${names}${sampled ? ", sampled" : ""}`;
+    say(chart.title, `${token}${about}${isLogarithmic ? ", log counts" : ""}`);
+    note(chart.svg, "aria-label", labels ? `Areas of ${token}: ${labels}` : `Histogram of ${token} from ${shortly(low)} to ${shortly(high)}`);
     putLines(chart);
   }
 
   function putLines(chart) {
-    const names = cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
+    // A threshold of levels has no place among areas.
+    const names = chart.histogram.labels ? [] : cuts.filter((cut) => cut.token === chart.token).flatMap((cut) => cut.names);
     keep(chart.lines, names, (name) => makeLine(chart, name, names.indexOf(name)));
     for (const name of names) if (!panel.isHeld(name)) chart.lines.get(name).put();
   }

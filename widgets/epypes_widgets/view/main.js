@@ -11,6 +11,7 @@ import { inMs } from "./numbers.js";
 import { optimisePart } from "./optimise.js";
 import { overlayCount } from "./overlay.js";
 import { probePart } from "./probe.js";
+import { picturesPart } from "./pictures.js";
 import { outbox } from "./protocol.js";
 import { roiPart } from "./roi.js";
 import { rowsPart } from "./rows.js";
@@ -113,6 +114,7 @@ function render({ model, el }) {
       described = report;
     },
     refresh: () => bar?.refresh(),
+    dress: (...given) => pictures.dress(...given),
     rowOf: (name) => rows.rowOf(name),
     drawRoi: () => roi.toggle(),
     widgetModel: (id) => model.widget_manager?.get_model(id).catch(() => null),
@@ -126,10 +128,11 @@ function render({ model, el }) {
   const stage = stagePart();
   const size = sizePart(figure, stage.box);
   const compare = (panel.compare = comparePart(panel, stage));
+  const pictures = picturesPart(panel, stage);
   const probe = probePart(panel, stage);
   const roi = roiPart(panel, stage);
   const histogram = histogramPart(panel);
-  bar = barPart(panel, { stage, compare, histogram, probe, roi });
+  bar = barPart(panel, { stage, compare, pictures, histogram, probe, roi });
   const chips = chipsPart(panel);
   const rows = rowsPart(panel, figure, closing.signal);
   const pinned = pinnedPart(panel);
@@ -139,14 +142,14 @@ function render({ model, el }) {
   const optimise = optimisePart(panel);
   const foot = footPart(panel);
   const frames = framesPart(panel, stage, failed);
-  const parts = [header, bar, chips, rows, roi, histogram, probe, pinned, films, video, history, optimise, foot];
+  const parts = [header, bar, chips, rows, pictures, roi, histogram, probe, pinned, films, video, history, optimise, foot];
   const all = (method, ...given) => parts.forEach((part) => part[method]?.(...given));
   stage.panByDrags();
   bar.listen(figure, closing.signal);
   header.element.append(size.wide);
   // Save and Promote are on the screen together with the picture.
   figure.append(
-    bar.element, chips.element, header.element, stage.element, size.handle, header.status, video.element, foot.element,
+    bar.element, chips.element, header.element, pictures.element, stage.element, size.handle, header.status, video.element, foot.element,
     histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element,
   );
   el.append(figure);
@@ -222,7 +225,7 @@ function render({ model, el }) {
     model.off("msg:custom", onMessage);
     out.close();
     stage.close();
-    [stage.picture, stage.other].forEach((img) => clear(img));
+    [stage.picture, stage.under, stage.other, stage.otherUnder].forEach((img) => clear(img));
     figure.remove();
   };
 }

@@ -59,11 +59,12 @@ export function inBox(place, pixel) {
 export function stagePart() {
   const picture = element("img", "epypes-picture", { alt: "", decoding: "sync", hidden: "", draggable: "false" });
   const other = element("img", "epypes-other", { alt: "", decoding: "sync", draggable: "false" });
+  const [under, otherUnder] = [0, 1].map(() => element("img", "epypes-under", { alt: "", decoding: "sync", draggable: "false" }));
   const [overlay, otherMarks] = [overlaySvg(), overlaySvg()];
   const roi = shape("svg", { class: "epypes-roi", preserveAspectRatio: "none" });
   // Above the marks of the big picture: where it is seen, these are not.
-  const layer = element("div", "epypes-layer", { hidden: "" }, other, otherMarks);
-  const canvas = element("div", "epypes-canvas", {}, picture, overlay, layer, roi);
+  const layer = element("div", "epypes-layer", { hidden: "" }, otherUnder, other, otherMarks);
+  const canvas = element("div", "epypes-canvas", {}, under, picture, overlay, layer, roi);
   const pane = element("div", "epypes-pane", {}, canvas);
   const secondCanvas = element("div", "epypes-canvas");
   const secondPane = element("div", "epypes-pane epypes-second", { hidden: "" }, secondCanvas);
@@ -142,7 +143,7 @@ export function stagePart() {
   sizes.observe(pane);
 
   return {
-    element: box, box, pane, secondPane, canvas, secondCanvas, picture, layer, other, otherMarks, overlay, roi, text, fit, pointOf,
+    element: box, box, pane, secondPane, canvas, secondCanvas, picture, under, layer, other, otherUnder, otherMarks, overlay, roi, text, fit, pointOf,
     /** Begin to pan by drags; what is drawn by a drag on the picture comes before that. */
     panByDrags: () => [pane, secondPane].forEach((one) => follow(one, onDown)),
     /** Take the size of the value shown; the place stays for one of the same size. */

@@ -42,6 +42,7 @@ export function pinnedPart(panel) {
         img.hidden = !bytes;
         say(text, picture.text ?? "");
         fill(img, bytes, picture.media_type);
+        panel.dress(img, picture);
         note(node, "aria-current", picture.token === frame.token);
       }
       root.hidden = pinned.length === 0;
