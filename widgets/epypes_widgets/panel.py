@@ -26,6 +26,7 @@ from epypes_widgets.screen import Screen
 from epypes_widgets.search import Search
 from epypes_widgets.session import Session, tunable
 from epypes_widgets.static import Displayed, StaticOutput, static_html
+from epypes_widgets.tiles import Tiles
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell
@@ -89,7 +90,8 @@ class Panel(Displayed):
             lambda key, request, delay_s: worker.post(key, request, delay_s, is_work=False), self._report
         )
         self._static = StaticOutput(self._static_html)
-        self._screen = Screen(view, session, self._history, token, tuple(controls.thresholds))
+        tiles = Tiles(session, self._history, cases, controls.movable)
+        self._screen = Screen(view, session, self._history, tiles, token, tuple(controls.thresholds))
         self._screen.setup, self._screen.code = self._setup, self.code
         self._stored: StoredHistory | None = None
         if store is not None:
@@ -202,6 +204,22 @@ class Panel(Displayed):
         self._tuning.look(token=self._screen.require_stage(token))
 
     @property
+    def tiles(self) -> tuple[str, ...]:
+        """The tokens whose numbers are shown beside the picture; at first the sinks and what a control changes.
+
+        Set others, or none. They are saved with the values.
+        """
+        return self._screen.pinned_tiles
+
+    @tiles.setter
+    def tiles(self, tokens: Iterable[str]) -> None:
+        self._require_open()
+        found = tuple(dict.fromkeys([tokens] if isinstance(tokens, str) else tokens))
+        for token in found:
+            self._runner.cg.require_token(token)
+        self._tuning.look(tiles=found)
+
+    @property
     def widget(self) -> Any:
         """The ipywidgets box that is shown, to be put into a layout of one's own."""
         return self._widget
@@ -231,17 +249,17 @@ class Panel(Displayed):
         return self._tuning.go_to(self._history.redo)
 
     def save(self, path: str | Path) -> Path:
-        """Write the values of all controls that can be moved to a TOML file, and return its path.
+        """Write the values of all controls that can be moved, and the tiles, to a TOML file, and return its path.
 
         Raises
         ------
         SettingsError
             With every reason why not.
         """
-        return settings.save(path, self._controls.movable, self._controls.params)
+        return settings.save(path, self._controls.movable, self._controls.params, self.tiles)
 
     def load(self, path: str | Path) -> None:
-        """Set the values that are in a TOML file, all or none.
+        """Set the values that are in a TOML file, all or none, and the tiles that it names.
 
         Raises
         ------
@@ -250,7 +268,11 @@ class Panel(Displayed):
         ValueError
             A value is outside of its range.
         """
-        self.set(**settings.load(path, {**self._runner.hyperparameters, **self.values}))
+        values = settings.load(path, {**self._runner.hyperparameters, **self.values})
+        tiles = settings.load_tiles(path)
+        self.set(**values)
+        if tiles is not None:  # a token that this graph does not have is passed over
+            self._tuning.look(tiles=tiles)
 
     def write_back(self, dry_run: bool = False, timeout_s: float = 60.0) -> WriteBack:
         """Write the values of the panel into the bundle of its service, when all that was set is set there.

@@ -15,6 +15,7 @@ from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import History, changed
 from epypes_widgets.session import Session, Tunable
 from epypes_widgets.stages import NO_STAGES, Stages, best_stage, stages, states
+from epypes_widgets.tiles import Tiles
 from epypes_widgets.values import is_same, json_values
 from epypes_widgets.view import PictureView
 
@@ -60,6 +61,8 @@ class Shown:
         Whether the histogram of the picture is shown.
     cut
         The tokens whose histograms are shown with thresholds on them.
+    tiles
+        The tokens whose numbers are shown beside it; None for those that matter.
     """
 
     token: str | None = None
@@ -67,6 +70,7 @@ class Shown:
     comparison: Comparison | None = None
     has_histogram: bool = False
     cut: tuple[str, ...] = ()
+    tiles: tuple[str, ...] | None = None
 
     @property
     def other(self) -> str:
@@ -102,6 +106,8 @@ class Screen:
         Its runs are shown.
     history
         Its entries are listed.
+    tiles
+        The numbers beside the picture.
     asked
         A token that is a stage in any case; None for none.
     cut
@@ -129,11 +135,17 @@ class Screen:
     code: Callable[[], str]
 
     def __init__(
-        self, view: PictureView, session: Session, history: History, asked: str | None, cut: tuple[str, ...]
+        self,
+        view: PictureView,
+        session: Session,
+        history: History,
+        tiles: Tiles,
+        asked: str | None,
+        cut: tuple[str, ...],
     ) -> None:
-        self.view = view
+        self.view, self.tiles = view, tiles
         before = _last_shown.get(session.runner, Shown())
-        self.shown = Shown(asked or before.token, before.pinned, has_histogram=bool(cut), cut=cut)
+        self.shown = Shown(asked or before.token, before.pinned, None, bool(cut), cut, before.tiles)
         self.stages: Stages = NO_STAGES
         self.error = ""
         self.compute_ms: float | None = None
@@ -163,13 +175,24 @@ class Screen:
             raise LookupError(f"{token!r} has no picture here.")
         return token
 
+    @property
+    def pinned_tiles(self) -> tuple[str, ...]:
+        """The tokens whose numbers are shown."""
+        return self.tiles.pinned(self.shown.tiles)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The tokens that must be computed for the next frame; everything without."""
+        targets = self.shown.targets
+        return (*targets, *self.tiles.prompt(self.pinned_tiles, targets)) if targets else ()
+
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
     def follow(self, run: Run) -> None:
         """Offer the stages that a completed run has; keep what is shown if it is among them."""
         found = stages(run, self.stages, self._asked)
         with self._lock:
-            is_new, self.stages = found != self.stages, found
+            is_new, self.stages = self.tiles.follow(run, found) or found != self.stages, found
             self.shown = self.shown.within(found, run)
         if is_new:
             self.send_setup()
@@ -191,6 +214,7 @@ class Screen:
             "image": image,
             "time_s": None if image is None else self._session.payloads.time_s(image),
             "stages": states(failed or run, self.stages),
+            "tiles": self.tiles.content(run, self.pinned_tiles, has_failed=failed is not None),
         }
         frame = make_frame(run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
         self.view.frames.offer(frame)
@@ -251,6 +275,7 @@ class Screen:
             "stages": [{"token": token, "is_picture": is_picture} for token, is_picture in self.stages.items()],
             "token": shown.token,
             "pinned": list(shown.pinned),
+            "numbers": list(self.tiles.offered),
             "histogram": shown.has_histogram,
             "closed": self._is_closed,
         }

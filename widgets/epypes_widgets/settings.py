@@ -7,7 +7,7 @@ import os
 import secrets
 import stat
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from epypes_widgets.values import numpy_type
 FORMAT: Final = "epypes settings 1"
 _SUFFIX: Final = ".toml"
 _SECTION: Final = "hyperparameters"
+_PANEL: Final = "panel"
 _ABOUT: Final = "Values of hyperparameters, saved by a panel of EPypes. They may be edited; the rest may not."
 _COMMENT_CHARACTERS: Final = 80
 # A longer file, or more reasons, are no settings that a panel has saved.
@@ -30,7 +31,12 @@ _MAX_REASONS: Final = 20
 _MEMBER: Final = "enum"
 
 
-def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, object] | None = None) -> Path:
+def save(
+    path: str | Path,
+    values: Mapping[str, Any],
+    params: Mapping[str, object] | None = None,
+    tiles: Sequence[str] = (),
+) -> Path:
     """Write values as TOML, in one step: a file that was there is whole at every moment.
 
     Parameters
@@ -41,6 +47,8 @@ def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, objec
         By hyperparameter.
     params
         By hyperparameter, the ranges and units that stand beside the values.
+    tiles
+        The tokens whose numbers are shown.
 
     Returns
     -------
@@ -56,7 +64,7 @@ def save(path: str | Path, values: Mapping[str, Any], params: Mapping[str, objec
     reasons = [reason for token, value in values.items() for reason in _unwritable(token, value)]
     if reasons:
         raise SettingsError(file, reasons)
-    text = _document(values, params or {})
+    text = _document(values, params or {}, tiles)
     try:
         if file.is_file() and not _is_ours(file):
             raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
@@ -96,6 +104,13 @@ def load(path: str | Path, present: Mapping[str, Any]) -> dict[str, Any]:
     if reasons:
         raise SettingsError(file, reasons[:_MAX_REASONS])
     return values
+
+
+def load_tiles(path: str | Path) -> tuple[str, ...] | None:
+    """Return the tokens whose numbers were shown when a file was saved; None if it does not say."""
+    panel = _document_in(_with_suffix(path)).get(_PANEL)
+    tiles = panel.get("tiles") if isinstance(panel, dict) else None
+    return tuple(filter(lambda token: isinstance(token, str), tiles)) if isinstance(tiles, list) else None
 
 
 def names(folder: str | Path) -> tuple[str, ...]:
@@ -144,7 +159,7 @@ def _unwritable(token: str, value: Any) -> Iterator[str]:
         )
 
 
-def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
+def _document(values: Mapping[str, Any], params: Mapping[str, object], tiles: Sequence[str]) -> str:
     with optional_import("widgets"):
         import tomlkit
 
@@ -163,6 +178,8 @@ def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
             item.comment(comment)
         table.add(token, item)
     document.add(_SECTION, table)
+    if tiles:
+        document.add(_PANEL, {"tiles": list(tiles)})
     return tomlkit.dumps(document)
 
 
@@ -187,6 +204,11 @@ def _replace(file: Path, text: str) -> None:
 
 
 def _entries(file: Path) -> dict[str, Any]:
+    entries: dict[str, Any] = _document_in(file)[_SECTION]
+    return entries
+
+
+def _document_in(file: Path) -> dict[str, Any]:
     try:
         found = file.stat()
         if not stat.S_ISDIR(found.st_mode) and not (stat.S_ISREG(found.st_mode) and found.st_size <= _MAX_BYTES):
@@ -204,7 +226,7 @@ def _entries(file: Path) -> dict[str, Any]:
         found_format = document.get("format", "no format")
         text = f"{file} has no settings of a panel: its format is {found_format!r:.40}, not {FORMAT!r}"
         raise SettingsError(file, [f"{text} with [{_SECTION}]."])
-    return entries
+    return document
 
 
 def _value(entry: Any, token: str, present: Any) -> Any:

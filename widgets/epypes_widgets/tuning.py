@@ -259,6 +259,7 @@ class Tuning:
         self._show_notice()
         if not is_settled:
             self.session.insist()
+        if not is_settled or (self._late_tiles(run) and not self.worker.is_pending("commit")):
             self._commit_later(REST_S)
         elif self._commits:
             self._commits = False
@@ -267,16 +268,18 @@ class Tuning:
 
     def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
         for _ in range(_MAX_ATTEMPTS):
-            run, is_settled = self.session.bring_up_to_date(
-                self.screen.shown.targets,
-                is_wanted=is_wanted,
-                is_superseded=self._is_superseded,
-                report=self.screen.note,
-            )
+            run, is_settled = self._run(self.screen.targets, is_wanted=is_wanted)
+            if self.screen.tiles.is_at_fault(run, self.screen.shown.targets):
+                run, is_settled = self._run(self.screen.shown.targets, is_wanted=is_wanted)
             if is_settled:
                 break
             self._follow_others()
         return run, is_settled
+
+    def _run(self, targets: Sequence[str], *, is_wanted: bool) -> tuple[Run, bool]:
+        return self.session.bring_up_to_date(
+            targets, is_wanted=is_wanted, is_superseded=self._is_superseded, report=self.screen.note
+        )
 
     def _refuse(self, error: Exception) -> None:
         """Say why there is no run."""
@@ -342,8 +345,10 @@ class Tuning:
 
     def _commit(self, *, is_final: bool = False) -> None:
         """Add the values that the runner has taken over to the history, unless they are there or held."""
-        run = self.session.result
-        if run is None or self.session.wanted or (self.controls.is_holding and not is_final):
+        if self.session.result is None or self.session.wanted:
+            return
+        run = self._with_late_tiles(self.session.result)
+        if self.controls.is_holding and not is_final:
             return
         self._add(run)
         entries = self.history.entries
@@ -356,8 +361,30 @@ class Tuning:
         if not len(self.session.payloads) and current is not None:
             image = current.image  # that of another panel on this runner
         token = self.screen.shown.token
-        about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms}
-        self.history.commit(run.hyperparameters, image=image, token=token, **about)
+        numbers = self.screen.tiles.numbers(run)
+        about = {"picture": thumbnail(run, token), "compute_ms": self.screen.compute_ms, "numbers": numbers}
+        if self.history.commit(run.hyperparameters, image=image, token=token, **about) is None and current is not None:
+            current.numbers.update(numbers)
+
+    def _late_tiles(self, run: Run) -> tuple[str, ...]:
+        return self.screen.tiles.late(run, self.screen.pinned_tiles)
+
+    def _with_late_tiles(self, run: Run) -> Run:
+        """Compute and show the tiles that the picture did not wait for; return the run that has them, if any."""
+        late, targets = self._late_tiles(run), self.screen.shown.targets
+        if not late or not targets or self.session.is_service:
+            return run
+        try:
+            whole, is_settled = self._run((*targets, *late), is_wanted=False)
+        except Exception:  # a newer value is wanted, or a placeholder needed: the tiles stay stale
+            return run
+        if not is_settled:
+            return run
+        if whole.failure is not None and not self.screen.tiles.is_at_fault(whole, targets):
+            return run
+        shown = self.session.result or run
+        self.screen.show(shown, 0)
+        return shown
 
     def _compare(self) -> None:
         """Show what the picture is compared with, if that is not part of its own run."""
