@@ -117,6 +117,13 @@ class Tiles:
         By test image, the checks that a tile passes or not.
     moved
         The hyperparameters that have a control.
+
+    Attributes
+    ----------
+    offered
+        The tokens that have been numbers, in graph order.
+    failures
+        By token, why a number can't be computed with the present values, as far as that was tried.
     """
 
     def __init__(self, session: Session, history: History, cases: Checks, moved: Collection[str]) -> None:
@@ -124,14 +131,13 @@ class Tiles:
         self._cg, self._moved = session.runner.cg, frozenset(moved)
         self._behind = cache(self._functions_behind)
         self._only_for_tiles = cache(self._functions_only_for)
-        # The tokens that have been numbers, in graph order.
         self.offered: dict[str, None] = {}
         self._defaults: tuple[str, ...] = ()
         # How long each function took; endless for one that has failed for a tile.
         self._costs_ns = dict.fromkeys(self._cg.functions, 0.0)
-        # What each tile showed last, and why it could not be computed.
+        # What each tile showed last.
         self._last: dict[str, str] = {}
-        self._failures: dict[str, str] = {}
+        self.failures: dict[str, str] = {}
         self._payload: tuple[Any, ...] = ()
 
     # -- which there are ----------------------------------------------------------------------------------------
@@ -178,16 +184,17 @@ class Tiles:
         return tuple(token for token in pinned if not _has(run, token))
 
     def is_at_fault(self, run: Run, targets: tuple[str, ...]) -> bool:
-        """Whether a run has failed in a function that no target needs, but only a tile; take note of it if so."""
+        """Whether a run has failed in a function that only a tile needs; that tile is then not prompt any more."""
         failure = run.failure
         if failure is None or not targets or self._session.is_service:
             return False
-        if any(failure.function in self._behind(target) for target in targets):
+        states = self._session.states
+        if any(failure.function in self._behind(token) for token in (*targets, *(states.targets if states else ()))):
             return False
         self._costs_ns[failure.function] = math.inf
         for token in self.offered:
             if failure.function in self._behind(token):
-                self._failures[token] = str(failure)
+                self.failures[token] = str(failure)
         return True
 
     def _cost_ns(self, token: str, targets: tuple[str, ...]) -> float:
@@ -220,11 +227,11 @@ class Tiles:
     def _tile(self, run: Run, token: str, before: Entry | None, has_failed: bool) -> dict[str, str]:
         tile = {"token": token, "text": self._last.get(token, "…"), "change": "", "state": "stale", "verdict": ""}
         if not _has(run, token):
-            reason = self._failures.get(token, "")
+            reason = self.failures.get(token, "")
             lines = [reason or "Not computed with these values yet."]
             tile["state"] = "failed" if reason else "stale"
         else:
-            self._failures.pop(token, None)
+            self.failures.pop(token, None)
             items = numbers_of(run[token])
             tile["text"] = self._last[token] = short_text(run[token]) if items is None else _text(items)
             if has_failed:

@@ -268,9 +268,10 @@ class Tuning:
 
     def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
         for _ in range(_MAX_ATTEMPTS):
+            self.screen.tiles.failures.clear()
             run, is_settled = self._run(self.screen.targets, is_wanted=is_wanted)
-            if self.screen.tiles.is_at_fault(run, self.screen.shown.targets):
-                run, is_settled = self._run(self.screen.shown.targets, is_wanted=is_wanted)
+            while self.screen.tiles.is_at_fault(run, self.screen.shown.targets):
+                run, is_settled = self._run(self.screen.targets, is_wanted=is_wanted)
             if is_settled:
                 break
             self._follow_others()
@@ -371,18 +372,21 @@ class Tuning:
 
     def _with_late_tiles(self, run: Run) -> Run:
         """Compute and show the tiles that the picture did not wait for; return the run that has them, if any."""
-        late, targets = self._late_tiles(run), self.screen.shown.targets
-        if not late or not targets or self.session.is_service:
+        tiles, targets = self.screen.tiles, self.screen.shown.targets
+        late = () if self.session.is_service else self._late_tiles(run)
+        if not (late and targets):
             return run
-        try:
-            whole, is_settled = self._run((*targets, *late), is_wanted=False)
-        except Exception:  # a newer value is wanted, or a placeholder needed: the tiles stay stale
+        is_at_fault = True
+        while late and is_at_fault:
+            try:
+                whole, is_settled = self._run((*targets, *late), is_wanted=False)
+            except Exception:  # a newer value is wanted, or a placeholder needed: the tiles stay stale
+                return run
+            is_at_fault = tiles.is_at_fault(whole, targets)
+            late = tuple(token for token in late if token not in tiles.failures)
+        if not (is_settled and (is_at_fault or whole.failure is None)):
             return run
-        if not is_settled:
-            return run
-        if whole.failure is not None and not self.screen.tiles.is_at_fault(whole, targets):
-            return run
-        shown = self.session.result or run
+        shown = run if is_at_fault else whole
         self.screen.show(shown, 0)
         return shown
 
