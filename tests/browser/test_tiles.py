@@ -45,6 +45,7 @@ WATCH = f"""() => {{
     const picture = document.querySelector('img.epypes-picture');
     new MutationObserver(() => {{
         const tile = document.querySelector('{AREA}');
+        if (!tile) return;
         const value = tile.querySelector('.epypes-tile-value').textContent;
         pairs.push([JSON.parse(picture.dataset.values).threshold, Number(value), tile.dataset.state]);
     }}).observe(picture, {{ attributes: true, attributeFilter: ['data-seq'] }});

@@ -86,9 +86,7 @@ class Panel(Displayed):
         self._history = history_of(self._runner)
         self._column = column(cg, controls.controls)
         self._worker = worker = Worker(failed=self._report)
-        view = PictureView(
-            lambda key, request, delay_s: worker.post(key, request, delay_s, is_work=False), self._report
-        )
+        view = PictureView(worker, self._report)
         self._static = StaticOutput(self._static_html)
         tiles = Tiles(session, self._history, cases, controls.movable)
         self._screen = Screen(view, session, self._history, tiles, token, tuple(controls.thresholds))

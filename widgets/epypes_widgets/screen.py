@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from itertools import count
 from typing import Any, Final
 from weakref import WeakKeyDictionary
@@ -216,8 +217,9 @@ class Screen:
             "stages": states(failed or run, self.stages),
             "tiles": self.tiles.content(run, self.pinned_tiles, has_failed=failed is not None),
         }
-        frame = make_frame(run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
-        self.view.frames.offer(frame)
+        make = partial(make_frame, run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
+        # Made when it is its turn: of those that newer ones replace no picture is encoded.
+        self.view.frames.offer(make)
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
         """Say what failed, and where; the picture stays. An empty text ends that."""

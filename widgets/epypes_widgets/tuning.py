@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from math import inf
 from time import perf_counter_ns
 from typing import Any, Final
 
@@ -68,7 +69,7 @@ class Tuning:
         self.is_live = True
         self._settled, self._is_superseded = settled, partial(worker.is_superseded, "compute")
         self._lock = threading.Lock()
-        self._commits = self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
+        self._commits = self._is_forced = self._has_looked = self._is_unwell = False
         self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
         for control in controls.controls:
             control.on_change(self._moved)
@@ -179,8 +180,7 @@ class Tuning:
 
     def seen(self) -> None:
         """Take note that a frame has been painted: what came meanwhile is next."""
-        if self._is_behind:
-            self._request()
+        self.worker.hasten("newer")
 
     def report(self, exception: BaseException) -> None:
         """Say what failed in the panel itself, in its log and in that of the process."""
@@ -294,10 +294,13 @@ class Tuning:
 
     def _waits_for_screen(self) -> bool:
         """Whether a newer run is to be fetched only when the picture on its way has been painted."""
-        # In this order: when the frame is painted right now, one of the two threads sees what the other has done.
-        self._is_behind = True
-        self._is_behind = self.screen.view.frames.in_flight is not None
-        return self._is_behind
+        frames = self.screen.view.frames
+        if frames.in_flight is None:
+            return False
+        self.worker.post("newer", self._request, inf, is_work=False)
+        if frames.in_flight is None:  # it was painted before that was posted
+            self.worker.hasten("newer")
+        return True
 
     def _show_notice(self) -> None:
         """Say what is wrong with the place where the functions run: the picture may not be the newest."""
