@@ -11,7 +11,6 @@ import math
 import numbers
 from collections.abc import Collection, Sequence
 from functools import cache
-from operator import is_not
 from typing import Any, Final
 
 from epypes.batch.cases import ABSENT, Check
@@ -138,7 +137,7 @@ class Tiles:
         # What each tile showed last.
         self._last: dict[str, str] = {}
         self.failures: dict[str, str] = {}
-        self._payload: tuple[Any, ...] = ()
+        self._payloads = session.foreign_payloads
 
     # -- which there are ----------------------------------------------------------------------------------------
 
@@ -181,7 +180,7 @@ class Tiles:
 
     def late(self, run: Run, pinned: tuple[str, ...]) -> tuple[str, ...]:
         """Return the pinned tokens that a run does not have."""
-        return tuple(token for token in pinned if not _has(run, token))
+        return tuple(token for token in pinned if not run.tokens.is_readable(token))
 
     def is_at_fault(self, run: Run, targets: tuple[str, ...]) -> bool:
         """Whether a run has failed in a function that only a tile needs; that tile is then not prompt any more."""
@@ -221,12 +220,12 @@ class Tiles:
     def numbers(self, run: Run) -> dict[str, tuple[Any, ...]]:
         """Return the numbers that a run has, for the entry of the history that it is committed as."""
         slots, values = run.tokens.program.slots, run.tokens.values
-        found = {token: numbers_of(values[slots[token]]) for token in self.offered if _has(run, token)}
+        found = {token: numbers_of(values[slots[token]]) for token in self.offered if run.tokens.is_readable(token)}
         return {token: items for token, items in found.items() if items is not None}
 
     def _tile(self, run: Run, token: str, before: Entry | None, has_failed: bool) -> dict[str, str]:
         tile = {"token": token, "text": self._last.get(token, "…"), "change": "", "state": "stale", "verdict": ""}
-        if not _has(run, token):
+        if not run.tokens.is_readable(token):
             reason = self.failures.get(token, "")
             lines = [reason or "Not computed with these values yet."]
             tile["state"] = "failed" if reason else "stale"
@@ -264,13 +263,11 @@ class Tiles:
 
     def _entry_before(self, run: Run) -> Entry | None:
         """Return the entry of the history that changes are counted from: the last one with other values."""
-        history, session = self._history, self._session
-        if not len(session.payloads):
-            payload = session.payload
-            if any(map(is_not, payload, self._payload)):  # the numbers of the entries are of another one
-                for entry in history.entries:
-                    entry.numbers.clear()
-            self._payload = payload
+        history, payloads = self._history, self._session.foreign_payloads
+        if payloads != self._payloads:  # the numbers of all entries are of another one
+            for entry in history.entries:
+                entry.numbers.clear()
+            self._payloads = payloads
         before = history.current
         if before is not None and self._is_of_image(before) and not differing(before.values, run.hyperparameters):
             before = history.previous
@@ -289,8 +286,3 @@ def requirement(check: Check) -> str:
     # What "equal" and "close" require without a bound goes without saying.
     bounds = [check.threshold] if check.threshold and not (expected and check.threshold == "at least 1") else []
     return f"{check.name}: {', '.join([*expected, *bounds, *options]) or 'true'}"
-
-
-def _has(run: Run, token: str) -> bool:
-    """Whether a token has a value of this very run."""
-    return run.tokens.is_computed(token) and not run.tokens.is_stale(token)

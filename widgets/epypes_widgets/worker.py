@@ -99,6 +99,8 @@ class Worker:
 
     def hasten(self, key: str) -> bool:
         """Have the request that waits under a key run without a further delay; return whether there is one."""
+        if key not in self._waiting:
+            return False
         with self._condition:
             request = self._waiting.get(key)
             if request is not None:
