@@ -33,8 +33,9 @@ _TITLE_CHARACTERS: Final = 600
 _FREE_NS: Final = 4_000_000
 _SHARE: Final = 0.1
 # Of integers with more digits, and of floats, so many are shown.
-_DIGITS: Final = 6
+_DIGITS: Final = 5
 _CHANGE_DIGITS: Final = 4
+_EXACT_DIGITS: Final = 12
 _LARGEST: Final = 10**12
 _GREATEST: Final = 1e300
 
@@ -74,19 +75,20 @@ def _plain(number: Any) -> bool | int | float:
     return int(number) if isinstance(number, numbers.Integral) else float(number)
 
 
-def _text(items: Sequence[Any], sign: str = "") -> str:
+def _text(items: Sequence[Any], digits: int = _DIGITS, sign: str = "") -> str:
     """Return what was made by ``numbers_of`` as text."""
-    return ", ".join(_item_text(item, sign) for item in items)
+    return ", ".join([_item_text(item, digits, sign) for item in items])
 
 
-def _item_text(item: Any, sign: str = "") -> str:
+def _item_text(item: Any, digits: int, sign: str) -> str:
     if isinstance(item, bool | str):
         return str(item)
     try:
         if isinstance(item, int) and abs(item) < _LARGEST:
             return f"{item:{sign}d}"
-        digits = _CHANGE_DIGITS if sign and abs(item) < 10**_CHANGE_DIGITS else _DIGITS
-        return f"{float(item):{sign}.{digits}g}"
+        # Without an exponent where that is not needed.
+        kind = ".0f" if 10**digits <= abs(item) < _LARGEST else f".{digits}g"
+        return f"{float(item):{sign}{kind}}"
     except OverflowError:  # an integer beyond all floats
         return "over 1e308" if item > 0 else "under -1e308"
 
@@ -100,7 +102,7 @@ def change_of(now: Sequence[Any] | None, before: Sequence[Any] | None) -> str:
         return "±0"
     if not all(type(item) in (int, float) and abs(item) < _GREATEST for item in (*now, *before)):
         return f"was {_text(before)}"
-    return _text([new - old for new, old in zip(now, before, strict=True)], "+")
+    return _text([new - old for new, old in zip(now, before, strict=True)], _CHANGE_DIGITS, "+")
 
 
 class Tiles:
@@ -224,7 +226,8 @@ class Tiles:
         return {token: items for token, items in found.items() if items is not None}
 
     def _tile(self, run: Run, token: str, before: Entry | None, has_failed: bool) -> dict[str, str]:
-        tile = {"token": token, "text": self._last.get(token, "…"), "change": "", "state": "stale", "verdict": ""}
+        text = exact = self._last.get(token, "…")
+        tile = {"token": token, "change": "", "state": "stale", "verdict": ""}
         if not run.tokens.is_readable(token):
             reason = self.failures.get(token, "")
             lines = [reason or "Not computed with these values yet."]
@@ -232,7 +235,10 @@ class Tiles:
         else:
             self.failures.pop(token, None)
             items = numbers_of(run[token])
-            tile["text"] = self._last[token] = short_text(run[token]) if items is None else _text(items)
+            text = exact = short_text(run[token]) if items is None else _text(items)
+            self._last[token] = text
+            if items is not None:
+                exact = _text(items, _EXACT_DIGITS)
             if has_failed:
                 lines = ["Of the picture that is shown: the run after it has failed."]
             else:
@@ -242,8 +248,7 @@ class Tiles:
                 if before is not None and known is not None and (change := change_of(items, known)):
                     tile["change"] = change
                     lines.insert(0, f"{change} since #{before.number}, where it was {_text(known)}")
-        tile["title"] = "\n".join([f"{token}: {tile['text']}", *lines])[:_TITLE_CHARACTERS]
-        return tile
+        return {**tile, "text": text, "title": "\n".join([f"{token}: {exact}", *lines])[:_TITLE_CHARACTERS]}
 
     def _verdict(self, run: Run, token: str) -> tuple[list[str], str]:
         """Return what the checks of the present test image say of a token, and ``"passed"`` or ``"failed"``."""
