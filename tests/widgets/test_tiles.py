@@ -183,6 +183,8 @@ def test_a_change_is_since_the_last_commit_and_not_since_the_last_step(
 
 
 def test_numbers_of_another_payload_are_no_change(panel: Panel, runner: ep.CompGraphRunner, screen: FrontEnd) -> None:
+    panel["threshold"] = 120
+    panel.wait(TIMEOUT_S)
     runner.run(image=np.full((20, 20), 200, np.uint8))
     panel.wait(TIMEOUT_S)
     assert (tile(screen)["text"], tile(screen)["change"]) == ("400", "")
@@ -194,6 +196,8 @@ def test_numbers_of_another_payload_are_no_change(panel: Panel, runner: ep.CompG
 def test_changes_are_counted_on_one_test_image(shown: Any, image: Any) -> None:
     images = [image, np.full_like(image, 200)]
     panel, screen = shown(runner_of({"count": count}, image), images=images)
+    panel["threshold"] = 120
+    panel.wait(TIMEOUT_S)
     screen.tell("image", index=1)
     panel.wait(TIMEOUT_S)
     assert (tile(screen)["text"], tile(screen)["change"]) == (str(image.size), "")

@@ -269,13 +269,15 @@ class Tiles:
     def _entry_before(self, run: Run) -> Entry | None:
         """Return the entry of the history that changes are counted from: the last one with other values."""
         history, payloads = self._history, self._session.foreign_payloads
+        before = shown = history.current
+        if shown is not None and self._is_of_image(shown) and not differing(shown.values, run.hyperparameters):
+            before = history.previous
         if payloads != self._payloads:  # the numbers of all entries are of another one
+            self._payloads = payloads
             for entry in history.entries:
                 entry.numbers.clear()
-            self._payloads = payloads
-        before = history.current
-        if before is not None and self._is_of_image(before) and not differing(before.values, run.hyperparameters):
-            before = history.previous
+            if shown is not None and before is not shown:
+                shown.numbers.update(self.numbers(run))
         return before if before is not None and self._is_of_image(before) else None
 
     def _is_of_image(self, entry: Entry) -> bool:
