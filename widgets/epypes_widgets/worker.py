@@ -1,4 +1,4 @@
-"""The thread of a panel, and the one place where the latest request wins.
+"""The thread of a panel, and the one place in the kernel where the latest wins: requests, and frames that wait.
 
 A callback of a control must return at once: it may be on the thread that handles the messages of the front end. So a
 request goes into a slot under its key and replaces the one that waits there, and one thread works on them in turn.
