@@ -299,6 +299,11 @@ class CheckResult(BatchResult[CheckOutcome]):
 # -- measuring --------------------------------------------------------------------------------------------------
 
 
+def check_value(check: Check, case: Case, value: Any, cg: CompGraph) -> CheckOutcome:
+    """Return the outcome of a check of one token for a value that it has; whatever a metric raises is its reason."""
+    return _measured(Outcome(0, case.name or "", kept={str(check.token): value}), case, check, cg)
+
+
 def _measured(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
     """Return the outcome of a check by the outcome of its case's run, which keeps the tokens that are measured."""
     value = expected = number = None

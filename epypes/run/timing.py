@@ -135,12 +135,18 @@ class RunReport(Displayed):
     @property
     def reused(self) -> tuple[str, ...]:
         """The functions whose outputs were still up to date."""
-        return tuple(entry.function for entry in self.functions if entry.reused)
+        others = {*self.ran_ns, *self._skipped}
+        return self._names(place for place in range(len(self.program.steps)) if place not in others)
 
     @property
     def skipped(self) -> tuple[str, ...]:
         """The functions that were not called since one of their inputs is Nothing."""
-        return tuple(entry.function for entry in self.functions if entry.skipped)
+        return self._names(sorted({*self._skipped} - self.ran_ns.keys()))
+
+    def _names(self, places: Iterable[int]) -> tuple[str, ...]:
+        """Return the names of those of these steps that the run needed."""
+        wanted, steps = self._wanted, self.program.steps
+        return tuple([steps[place].name for place in places if wanted is None or wanted[place]])
 
     @property
     def critical_path_ns(self) -> int:

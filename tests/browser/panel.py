@@ -16,6 +16,16 @@ DIGEST = """async () => {
 }"""
 
 
+# All is computed, and no frame is on its way or waits for that.
+_SETTLED = """
+import threading
+panel.wait(60)
+while panel._screen.view.frames.in_flight is not None or panel._worker.is_pending("frame"):
+    threading.Event().wait(0.005)
+print(panel._screen.view.frames.newest.seq)
+"""
+
+
 class PanelOnScreen:
     """The panel of a notebook as a hand and an eye have it."""
 
@@ -106,7 +116,7 @@ class PanelOnScreen:
 
     def settle(self) -> None:
         """Return when everything is computed, committed and on the screen; the panel is called that in the kernel."""
-        seq = int(self.notebook.execute("panel.wait(60); print(panel._screen.view.frames.newest.seq)"))
+        seq = int(self.notebook.execute(_SETTLED))
         self.wait("seq => document.querySelector('img.epypes-picture').dataset.seq >= seq", seq)
 
     def wait_for_status(self, text: str) -> None:

@@ -857,3 +857,71 @@ def test_a_closed_view_leaves_nothing_behind_and_another_can_be_mounted(view: Vi
     view.do("kernel.seq = 0; kernel.mount()")
     view.until("document.querySelector('img.epypes-picture')?.dataset.seq")
     view.until("document.querySelectorAll('.epypes-tail').length === 5")
+
+
+# -- numbers ----------------------------------------------------------------------------------------------------
+
+TILE = ".epypes-tile[data-token=n_edges]"
+
+
+def test_a_number_is_written_at_the_moment_its_picture_appears(view: ViewPage) -> None:
+    view.do(
+        """
+        window.wrong = [];
+        const [picture, tiles] = ['.epypes-picture', '.epypes-tiles'].map(css => document.querySelector(css));
+        const value = tiles.querySelector('.epypes-tile-value');
+        new MutationObserver(() => {
+            const { seq, values } = picture.dataset;
+            if (tiles.dataset.seq !== seq || value.textContent !== String(JSON.parse(values).canny_lo)) wrong.push(seq);
+        }).observe(picture, { attributes: true, attributeFilter: ['data-seq'] });
+        for (let i = 0; i < 30; i++) { kernel.values.canny_lo = 70 + i; await kernel.run(); await kernel.painted(); }
+        """
+    )
+    view.settle()
+    assert view.text(f"{TILE} .epypes-tile-value") == "99"
+    assert view.text(f"{TILE} .epypes-tile-change") == "+3"
+    assert view.js("wrong") == []
+
+
+def test_a_number_is_pinned_by_the_menu_or_at_its_token_and_let_go_of_at_its_tile(view: ViewPage) -> None:
+    menu, pin = ".epypes-more-tiles", ".epypes-chip-box:has([data-token=n_edges]) > .epypes-pin"
+    assert view.js(f"[...document.querySelector('{menu}').options].map(one => one.value)") == ["", "mean"]
+    assert view.attribute(pin, "aria-pressed") == "true"
+    view.page.select_option(menu, "mean")
+    view.until("document.querySelector('.epypes-tile[data-token=mean]')")
+    assert not view.shown(menu)
+    view.click(f"{TILE} .epypes-unpin")
+    view.until(f"!document.querySelector('{TILE}')")
+    view.until(f"document.querySelector('{pin}').getAttribute('aria-pressed') === 'false'")
+    view.click(pin)
+    view.until(f"document.querySelector('{TILE}')")
+    assert [(one["token"], one["on"]) for one in view.sent("pin")] == [
+        ("mean", True),
+        ("n_edges", False),
+        ("n_edges", True),
+    ]
+
+
+@pytest.mark.parametrize("colours", ["light", "dark"])
+def test_a_tile_says_by_signs_and_colours_what_it_is_and_never_moves(view: ViewPage, colours: str) -> None:
+    view.open(theme=colours)
+    view.do("kernel.tiles = ['n_edges', 'mean']; await kernel.run()")
+    view.settle()
+    places = "[...document.querySelectorAll('.epypes-tile, .epypes-status')].map(node => JSON.stringify(node.getBoundingClientRect()))"
+    before, seen = view.js(places), set()
+    for state, verdict, sign in (
+        ("fresh", "", ""),
+        ("fresh", "passed", "✓"),
+        ("fresh", "failed", "✗"),
+        ("stale", "", "~"),
+        ("failed", "", "!"),
+    ):
+        text, change = ("1234567890", "+1234567890") if sign else ("1", "")
+        tile = {"token": "n_edges", "state": state, "verdict": verdict, "text": text, "change": change, "title": "told"}
+        view.page.evaluate("async tile => kernel.run({ tiles: [tile, { ...tile, token: 'mean' }] })", tile)
+        view.settle()
+        assert (view.text(f"{TILE} .epypes-verdict-sign"), view.attribute(TILE, "title")) == (sign, "told")
+        assert view.js(places) == before
+        assert unreadable(view.page, ".epypes-tiles") == []
+        seen.add(view.js(f"getComputedStyle(document.querySelector('{TILE} .epypes-tile-value')).color"))
+    assert len(seen) == 3

@@ -511,3 +511,29 @@ def test_a_service_that_has_found_nothing_shows_what_it_skipped(tmp_path: Any, m
         assert (frame["stages"]["marked"], frame["ran"], frame["skipped"]) == ("nothing", 1, 1)
         assert panel.result["marked"] is ep.Nothing
         panel.close(TIMEOUT_S)
+
+
+def test_the_numbers_of_a_service_come_with_each_picture(
+    image: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cg = ep.CompGraph(
+        {"above": lambda image, threshold: (image > threshold).astype(np.uint8) * 255, "count": np.count_nonzero},
+        {"above": (("image", "threshold"), "mask"), "count": ("mask", "n")},
+    )
+    runner = ep.CompGraphRunner(cg, {"threshold": 100})
+    runner.run(image=image)
+    service = Standing(runner, tmp_path, {"threshold": {"low": 0, "high": 255}}, outputs=("mask", "n"))
+    service.event(image=image)
+    with standing(service) as server, ep.connect(f"{server.url}#token={server.token}") as connection:
+        panel = tune(connection, token="mask")
+        try:
+            panel.wait(TIMEOUT_S)
+            screen = FrontEnd(panel, monkeypatch)
+            for threshold in (100, 60):
+                panel["threshold"] = threshold
+                panel.wait(TIMEOUT_S)
+                (tile,) = screen.frames[-1]["tiles"]
+                assert (tile["text"], tile["state"]) == (str(np.count_nonzero(image > threshold)), "fresh")
+            assert tile["change"] == f"{np.count_nonzero(image > 60) - np.count_nonzero(image > 100):+d}"
+        finally:
+            panel.close(TIMEOUT_S)

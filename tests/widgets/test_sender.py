@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
@@ -12,40 +13,88 @@ from hypothesis import strategies as st
 
 from epypes_widgets.frames import Frame
 from epypes_widgets.view import FrameSender
+from epypes_widgets.worker import Worker
 
 
 def frame(seq: int) -> Frame:
     return Frame(seq, {"seq": seq})
 
 
-class Clock:
-    """Calls what was put off when it is told to."""
+class Slots(Worker):
+    """A worker without a thread: what is posted waits until it is hastened, or its delay is over."""
 
     def __init__(self) -> None:
-        self.delay_s = 0.0
-        self.due: Callable[[], object] = lambda: None
+        super().__init__()
+        self.waits: dict[str, tuple[Callable[[], object], float]] = {}
+        self.hastened: list[str] = []
 
-    def __call__(self, key: str, function: Callable[[], object], delay_s: float) -> None:
-        self.delay_s, self.due = delay_s, function
+    @property
+    def delay_s(self) -> float:
+        """After which the frame in flight is taken for lost."""
+        return self.waits["lost frame"][1]
+
+    def post(self, key: str, request: Callable[[], object], delay_s: float = 0.0, *, is_work: bool = True) -> None:
+        assert not is_work, "Panel.wait() does not wait for the browser"
+        self.waits[key] = request, delay_s
+
+    def hasten(self, key: str) -> bool:
+        if key in self.waits:
+            self.hastened.append(key)
+        return key in self.waits
+
+    def run(self) -> None:
+        """Run what was hastened."""
+        while self.hastened:
+            request, _ = self.waits.pop(self.hastened.pop(0), (lambda: None, 0.0))
+            request()
+
+    def due(self) -> None:
+        """Let the time of the frame in flight be over."""
+        self.waits.pop("lost frame")[0]()
+        self.run()
 
 
-def never(key: str, function: object, delay_s: float) -> None:
-    """Stand for a clock that has not got so far."""
+class Sending:
+    """A sender, what it has sent, and its worker."""
+
+    def __init__(self, send: Callable[[Frame], None] = lambda frame: None) -> None:
+        self.sent: list[int] = []
+        self.made: list[int] = []
+        self.slots = Slots()
+
+        def keep(frame: Frame) -> None:
+            self.sent.append(frame.seq)
+            send(frame)
+
+        self.sender = FrameSender(keep, self.slots)
+
+    def offer(self, seq: int) -> None:
+        def make() -> Frame:
+            self.made.append(seq)
+            return frame(seq)
+
+        self.sender.offer(make)
+        self.slots.run()
+
+    def painted(self, seq: int) -> None:
+        self.sender.painted(seq)
+        self.slots.run()
+
+    def ready(self) -> None:
+        self.sender.mount()
+        self.sender.ready()
+        self.slots.run()
 
 
-def sent_by(steps: Sequence[tuple[str, int]]) -> tuple[list[int], FrameSender]:
+def sent_by(steps: Sequence[tuple[str, int]]) -> tuple[list[int], Sending]:
     """Play steps on a sender; return what it sent."""
-    sent: list[int] = []
-    sender = FrameSender(lambda frame: sent.append(frame.seq), never)
+    sending = Sending()
     for step, seq in steps:
-        if step == "offer":
-            sender.offer(frame(seq))
-        elif step == "painted":
-            sender.painted(seq)
+        if step == "ready":
+            sending.ready()
         else:
-            sender.mount()
-            sender.ready()
-    return sent, sender
+            getattr(sending, step)(seq)
+    return sending.sent, sending
 
 
 def test_nothing_is_sent_before_a_view_is_there() -> None:
@@ -67,7 +116,9 @@ def test_acknowledgements_that_are_late_or_come_twice_change_nothing() -> None:
 
 
 def test_a_view_that_is_mounted_anew_gets_the_newest_even_if_an_acknowledgement_was_lost() -> None:
-    assert sent_by([("ready", 0), ("offer", 1), ("offer", 2), ("ready", 0)])[0] == [1, 2]
+    mounted_anew = [("ready", 0), ("offer", 1), ("offer", 2), ("ready", 0)]
+    assert sent_by(mounted_anew)[0] == [1, 1]  # at once, also while the worker is busy
+    assert sent_by([*mounted_anew, ("painted", 1)])[0] == [1, 1, 2]
     assert sent_by([("ready", 0), ("offer", 1), ("painted", 1), ("ready", 0)])[0] == [1, 1]
 
 
@@ -84,26 +135,28 @@ _STEPS = st.lists(
 
 @given(_STEPS)
 def test_the_frame_offered_last_is_delivered_last_once_all_is_acknowledged(steps: list[Any]) -> None:
-    sent: list[int] = []
-    sender = FrameSender(lambda frame: sent.append(frame.seq), never)
-    offered = 0
+    sending, offered = Sending(), 0
     for step in ["ready", *steps]:
-        before = len(sent)
+        before = len(sending.sent)
         if step == "offer":
             offered += 1
-            sender.offer(frame(offered))
+            sending.offer(offered)
         elif step == "ready":
-            sender.mount()
-            sender.ready()
+            sending.ready()
         elif step == "painted in flight":
-            sender.painted(sender.in_flight.seq if sender.in_flight else 0)
+            sending.painted(sending.sender.in_flight.seq if sending.sender.in_flight else 0)
         else:
-            sender.painted(step[1])
-        assert len(sent) - before <= 1
-    while sender.in_flight is not None:
-        sender.painted(sender.in_flight.seq)
-    assert sent[-1:] == ([offered] if offered else [])
-    assert sent == sorted(sent)
+            sending.painted(step[1])
+        assert len(sending.sent) - before <= 1
+    while sending.sender.in_flight is not None:
+        sending.painted(sending.sender.in_flight.seq)
+    assert sending.sent[-1:] == ([offered] if offered else [])
+    assert sending.sent == sorted(sending.sent)
+
+
+def test_of_frames_that_newer_ones_replace_none_is_made() -> None:
+    _, sending = sent_by([("ready", 0), *(("offer", seq) for seq in range(1, 10)), ("painted", 1)])
+    assert sending.made == [1, 9]
 
 
 def test_a_front_end_on_another_thread_that_answers_wildly_still_gets_the_last_frame() -> None:
@@ -111,7 +164,8 @@ def test_a_front_end_on_another_thread_that_answers_wildly_still_gets_the_last_f
     seen: list[int] = []
     complete = threading.Event()
     last = 2000
-    sender = FrameSender(lambda frame: arrived.put(frame.seq), never)
+    worker = Worker()
+    sender = FrameSender(lambda frame: arrived.put(frame.seq), worker)
     sender.mount()
     sender.ready()
 
@@ -127,89 +181,72 @@ def test_a_front_end_on_another_thread_that_answers_wildly_still_gets_the_last_f
     thread = threading.Thread(target=front_end, daemon=True)
     thread.start()
     for seq in range(1, last + 1):
-        sender.offer(frame(seq))
+        worker.post("compute", partial(sender.offer, partial(frame, seq)))
     assert complete.wait(60)
     thread.join(60)
+    worker.close(60)
     assert seen == sorted(seen)
 
 
 def test_an_answer_from_within_sending_is_allowed() -> None:
-    seen: list[int] = []
-
-    def send(frame: Frame) -> None:
-        seen.append(frame.seq)
-        sender.painted(frame.seq)
-
-    sender = FrameSender(send, never)
-    sender.mount()
-    sender.ready()
-    sender.offer(frame(1))
-    sender.offer(frame(2))
-    assert (seen, sender.in_flight) == ([1, 2], None)
+    sending = Sending(lambda frame: sending.sender.painted(frame.seq) and None)
+    sending.ready()
+    sending.offer(1)
+    sending.offer(2)
+    assert (sending.sent, sending.sender.in_flight) == ([1, 2], None)
 
 
 def test_a_frame_or_an_answer_that_is_lost_is_made_good_with_the_newest() -> None:
-    sent: list[int] = []
-    clock = Clock()
-    sender = FrameSender(lambda frame: sent.append(frame.seq), clock)
-    sender.mount()
-    sender.ready()
-    sender.offer(frame(1))
-    clock.due()
+    sent, sending = sent_by([("ready", 0), ("offer", 1)])
+    sending.slots.due()
     assert sent == [1, 1]
-    sender.offer(frame(2))
+    sending.offer(2)
     assert sent == [1, 1]
-    clock.due()
+    sending.slots.due()
     assert sent == [1, 1, 2]
-    sender.painted(2)
-    clock.due()
+    sending.painted(2)
+    sending.slots.due()
     assert sent == [1, 1, 2]
 
 
 def test_a_screen_that_is_gone_is_asked_less_and_less_often() -> None:
-    clock = Clock()
-    sender = FrameSender(lambda frame: None, clock)
-    sender.mount()
-    sender.ready()
-    sender.offer(frame(1))
+    _, sending = sent_by([("ready", 0), ("offer", 1)])
     delays = []
     for _ in range(8):
-        delays.append(clock.delay_s)
-        clock.due()
+        delays.append(sending.slots.delay_s)
+        sending.slots.due()
     assert delays == [2.0, 4.0, 8.0, 16.0, 32.0, 32.0, 32.0, 32.0]
-    sender.painted(1)
-    sender.offer(frame(2))
-    assert clock.delay_s == 2.0
+    sending.painted(1)
+    sending.offer(2)
+    assert sending.slots.delay_s == 2.0
 
 
 def test_of_two_views_one_may_be_removed() -> None:
-    sent: list[int] = []
-    sender = FrameSender(lambda frame: sent.append(frame.seq), never)
-    for _ in range(2):
-        sender.mount()
-        sender.ready()
+    sent, sending = sent_by([("ready", 0), ("ready", 0)])
+    sender = sending.sender
     sender.closed()
-    sender.offer(frame(1))
+    sending.offer(1)
     assert (sent, sender.mounted, sender.left) == ([1], True, False)
     sender.closed()
     sender.closed()
     assert (sender.mounted, sender.left) == (False, True)
-    sender.mount()
-    sender.ready()
+    sending.ready()
     assert sent == [1, 1]
 
 
 def test_nothing_is_sent_to_a_view_that_was_removed() -> None:
-    sent: list[int] = []
-    clock = Clock()
-    sender = FrameSender(lambda frame: sent.append(frame.seq), clock)
-    sender.mount()
-    sender.ready()
-    sender.offer(frame(1))
-    sender.closed()
-    clock.due()
-    sender.offer(frame(2))
-    assert (sent, sender.mounted) == ([1], False)
-    sender.mount()
-    sender.ready()
+    sent, sending = sent_by([("ready", 0), ("offer", 1), ("offer", 2)])
+    sending.sender.closed()
+    sending.slots.run()
+    sending.slots.due()
+    sending.offer(3)
+    assert (sent, sending.sender.mounted) == ([1], False)
+    sending.ready()
+    assert sent == [1, 3]
+
+
+def test_once_the_worker_is_closed_nothing_waits() -> None:
+    sent, sending = sent_by([("ready", 0), ("offer", 1)])
+    sending.slots.close(60)
+    sending.offer(2)
     assert sent == [1, 2]

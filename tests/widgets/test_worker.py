@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from time import monotonic
 
@@ -106,6 +107,24 @@ def test_what_is_due_first_is_run_first_whenever_it_was_requested(worker: Worker
     worker.wait(60)
     assert done == ["first", "second"]
     assert monotonic() - start_s >= 0.06
+    worker.close(10)
+
+
+def test_what_has_no_end_of_its_delay_is_run_when_it_is_hastened(worker: Worker) -> None:
+    order: list[str] = []
+    assert not worker.hasten("frame")
+    worker.post("frame", lambda: order.append("older"), math.inf, is_work=False)
+    worker.post("frame", lambda: order.append("frame"), math.inf, is_work=False)
+    worker.post("compute", lambda: order.append("computed"))
+    worker.wait(60)
+    assert order == ["computed"]
+    done = threading.Event()
+    worker.post("late", done.set, math.inf)
+    assert worker.hasten("frame")
+    assert worker.hasten("late")
+    assert done.wait(60)
+    worker.wait(60)
+    assert order == ["computed", "frame"]
     worker.close(10)
 
 

@@ -16,7 +16,7 @@ or, for one function, ``interact(edges, image, lo=(0, 255))``. ``panel`` has the
 - ``session``: what is wanted of a runner or a running service, and what it has computed; ``frame_states``: what the
   frames of a sequence begin with
 - ``worker``: the thread that computes; ``tuning``: what it does
-- ``screen``: what is shown; ``frames``, ``stages``, ``histogram``: tokens of a run for the screen
+- ``screen``: what is shown; ``frames``, ``stages``, ``histogram``, ``tiles``: tokens of a run for the screen
 - ``view``: the script in the browser, and the frames on their way to it
 
 What a hyperparameter may be: ``ranges``, ``tooltips``, ``values``. What is remembered: ``history`` and

@@ -102,14 +102,15 @@ def make_frame(
         pictures.append(drawn(shown.other, "other"))
     pictures += [drawn(pinned, "pinned", max_side_px=PINNED_SIDE_PX) for pinned in shown.pinned]
     report = run.report
+    durations_ns = report.durations_ns
     content = {
         "kind": "frame",
         "seq": seq,
         "token": token,
         "values": json_values(run.hyperparameters),
         "compute_ms": report.total_ns / 1e6,
-        "times_ms": {name: ns / 1e6 for name, ns in report.durations_ns.items()},
-        "ran": len(report.ran),
+        "times_ms": {name: ns / 1e6 for name, ns in durations_ns.items()},
+        "ran": len(durations_ns),
         "reused": len(report.reused),
         "skipped": len(report.skipped),
         "pictures": [described for described, _ in pictures],

@@ -54,6 +54,8 @@ class Entry:
         A word of the user's or the panel's on it; may be empty.
     image
         Which of the panel's images it was computed on, from 0; None if it has no list of them.
+    numbers
+        By token, what the tiles of a run with these values show; added to when more of them are computed.
     left
         The number of the entry that was left for it; 0 for the first.
     """
@@ -67,6 +69,7 @@ class Entry:
     label: str = ""
     image: int | None = None
     left: int = 0
+    numbers: dict[str, tuple[Any, ...]] = field(default_factory=dict, repr=False)
 
 
 class History:
@@ -119,7 +122,7 @@ class History:
         values, image
             As in ``Entry``.
         about
-            What else ``Entry`` has: token, picture, compute_ms, label.
+            What else ``Entry`` has: token, picture, compute_ms, label, numbers.
 
         Returns
         -------
@@ -175,6 +178,12 @@ class History:
         """The entry that was committed or gone to last; None before the first."""
         with self._lock:
             return self._path[self._place] if self._path else None
+
+    @property
+    def previous(self) -> Entry | None:
+        """The entry that ``undo`` would go to; None if there is none."""
+        with self._lock:
+            return self._path[self._place - 1] if self._place > 0 else None
 
     @property
     def can_undo(self) -> bool:

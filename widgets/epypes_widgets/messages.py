@@ -126,9 +126,13 @@ class Messages:
     # -- looking ------------------------------------------------------------------------------------------------
 
     def _pin(self, message: Message) -> None:
-        token = self._screen.require_stage(message["token"])
-        others = tuple(name for name in self._screen.shown.pinned if name != token)
-        self._tuning.look(pinned=(*others, token) if message["on"] else others)
+        """Pin a token, or let go of it: a picture beneath the big one, a number as a tile."""
+        token, screen = message["token"], self._screen
+        is_tile = token in screen.tiles.offered
+        pinned = screen.pinned_tiles if is_tile else screen.shown.pinned
+        others = tuple(name for name in pinned if name != token)
+        now = (*others, token if is_tile else screen.require_stage(token)) if message["on"] else others
+        self._tuning.look(**{"tiles" if is_tile else "pinned": now})
 
     def _compare(self, message: Message) -> None:
         asked, comparison = message["with"], None

@@ -28,6 +28,7 @@ from epypes_widgets.screen import Screen
 from epypes_widgets.search import Search
 from epypes_widgets.session import Session, tunable
 from epypes_widgets.static import Displayed, StaticOutput, static_html
+from epypes_widgets.tiles import Tiles
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell
@@ -91,11 +92,10 @@ class Panel(Displayed):
         self._history = history_of(self._runner)
         self._column = column(cg, controls.controls)
         self._worker = worker = Worker(failed=self._report)
-        view = PictureView(
-            lambda key, request, delay_s: worker.post(key, request, delay_s, is_work=False), self._report
-        )
+        view = PictureView(worker, self._report)
         self._static = StaticOutput(self._static_html)
-        self._screen = Screen(view, session, self._history, token, tuple(controls.thresholds))
+        tiles = Tiles(session, self._history, cases, controls.movable)
+        self._screen = Screen(view, session, self._history, tiles, token, tuple(controls.thresholds))
         self._screen.setup, self._screen.code = self._setup, self.code
         self._stored: StoredHistory | None = None
         if store is not None:
@@ -251,6 +251,22 @@ class Panel(Displayed):
         self._tuning.look()
 
     @property
+    def tiles(self) -> tuple[str, ...]:
+        """The tokens whose numbers are shown beside the picture; at first the sinks and what a control changes.
+
+        Set others, or none. They are saved with the values.
+        """
+        return self._screen.pinned_tiles
+
+    @tiles.setter
+    def tiles(self, tokens: Iterable[str]) -> None:
+        self._require_open()
+        found = tuple(dict.fromkeys([tokens] if isinstance(tokens, str) else tokens))
+        for token in found:
+            self._runner.cg.require_token(token)
+        self._tuning.look(tiles=found)
+
+    @property
     def widget(self) -> Any:
         """The ipywidgets box that is shown, to be put into a layout of one's own."""
         return self._widget
@@ -280,19 +296,19 @@ class Panel(Displayed):
         return self._tuning.go_to(self._history.redo)
 
     def save(self, path: str | Path) -> Path:
-        """Write the values of all controls that can be moved, and how pictures are shown, to a TOML file.
+        """Write the values of all controls that can be moved, how pictures are shown, and the tiles, to a TOML file.
 
         Raises
         ------
         SettingsError
             With every reason why not.
         """
-        return settings.save(path, self._controls.movable, self._controls.params, self.pictures)
+        return settings.save(path, self._controls.movable, self._controls.params, self.pictures, self.tiles)
 
     def load(self, path: str | Path) -> None:
-        """Set the values that are in a TOML file, all or none, and show pictures as it says.
+        """Set the values that are in a TOML file, all or none, and show pictures and tiles as it says.
 
-        How a token is shown that the graph does not have is passed over.
+        What it says of tokens that the graph does not have is passed over.
 
         Raises
         ------
@@ -301,11 +317,13 @@ class Panel(Displayed):
         ValueError
             A value is outside of its range.
         """
-        pictures, cg = settings.load_pictures(path), self._runner.cg
+        pictures, tiles, cg = settings.load_pictures(path), settings.load_tiles(path), self._runner.cg
         self.set(**settings.load(path, {**self._runner.hyperparameters, **self.values}))
         for token, each in pictures.items():
             if all(map(cg.has_token, filter(None, (token, each.over)))):
                 self.show_as(token, **each.content)
+        if tiles is not None:
+            self._tuning.look(tiles=tiles)
 
     def write_back(self, dry_run: bool = False, timeout_s: float = 60.0) -> WriteBack:
         """Write the values of the panel into the bundle of its service, when all that was set is set there.

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from itertools import count
 from typing import Any, Final
 from weakref import WeakKeyDictionary
@@ -16,6 +17,7 @@ from epypes_widgets.history import History, changed
 from epypes_widgets.picture_settings import Limits, PictureSettings
 from epypes_widgets.session import Session, Tunable
 from epypes_widgets.stages import NO_STAGES, Stages, best_stage, scalars, stages, states
+from epypes_widgets.tiles import Tiles
 from epypes_widgets.values import is_same, json_values
 from epypes_widgets.view import PictureView
 
@@ -68,6 +70,8 @@ class Shown:
         Whether the numbers that belong to the big picture are written on it.
     scalars
         The tokens of these numbers.
+    tiles
+        The tokens whose numbers are shown beside it; None for those that matter.
     """
 
     token: str | None = None
@@ -78,6 +82,7 @@ class Shown:
     pictures: Mapping[str, PictureSettings] = field(default_factory=dict)
     has_scalars: bool = False
     scalars: tuple[str, ...] = ()
+    tiles: tuple[str, ...] | None = None
 
     def with_scalars(self, run: Run | None) -> Shown:
         """Return it with the numbers that belong to the big picture, as far as a run shows which these are."""
@@ -129,6 +134,8 @@ class Screen:
         Its runs are shown.
     history
         Its entries are listed.
+    tiles
+        The numbers beside the picture.
     asked
         A token that is a stage in any case; None for none.
     cut
@@ -156,9 +163,15 @@ class Screen:
     code: Callable[[], str]
 
     def __init__(
-        self, view: PictureView, session: Session, history: History, asked: str | None, cut: tuple[str, ...]
+        self,
+        view: PictureView,
+        session: Session,
+        history: History,
+        tiles: Tiles,
+        asked: str | None,
+        cut: tuple[str, ...],
     ) -> None:
-        self.view = view
+        self.view, self.tiles = view, tiles
         before = _last_shown.get(session.runner, Shown())
         first = replace(before, token=asked or before.token, comparison=None, has_histogram=bool(cut), cut=cut)
         self.shown = first.with_scalars(session.result)
@@ -200,13 +213,24 @@ class Screen:
             raise LookupError(f"{token!r} has no picture here.")
         return token
 
+    @property
+    def pinned_tiles(self) -> tuple[str, ...]:
+        """The tokens whose numbers are shown."""
+        return self.tiles.pinned(self.shown.tiles)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The tokens that must be computed for the next frame; everything without."""
+        targets = self.shown.targets
+        return (*targets, *self.tiles.prompt(self.pinned_tiles, targets)) if targets else ()
+
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
     def follow(self, run: Run) -> None:
         """Offer the stages that a completed run has; keep what is shown if it is among them."""
         found = stages(run, self.stages, self._asked)
         with self._lock:
-            is_new, self.stages = found != self.stages, found
+            is_new, self.stages = self.tiles.follow(run, found) or found != self.stages, found
             self.shown = self.shown.within(found, run).with_scalars(run)
         if is_new:
             self.send_setup()
@@ -228,9 +252,11 @@ class Screen:
             "image": image,
             "time_s": None if image is None else self._session.payloads.time_s(image),
             "stages": states(failed or run, self.stages),
+            "tiles": self.tiles.content(run, self.pinned_tiles, has_failed=failed is not None),
         }
-        frame = make_frame(run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
-        self.view.frames.offer(frame)
+        make = partial(make_frame, run, shown.token, self._seq(), shown, changed_ns, self._pictures, **content)
+        # Made when it is its turn: of those that newer ones replace no picture is encoded.
+        self.view.frames.offer(make)
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
         """Say what failed, and where; the picture stays. An empty text ends that."""
@@ -298,6 +324,7 @@ class Screen:
             "stages": [{"token": token, "is_picture": is_picture} for token, is_picture in self.stages.items()],
             "token": shown.token,
             "pinned": list(shown.pinned),
+            "numbers": list(self.tiles.offered),
             "histogram": shown.has_histogram,
             "scalars": shown.has_scalars,
             "pictures": {token: each.content for token, each in shown.pictures.items()},

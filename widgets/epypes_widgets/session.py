@@ -59,6 +59,8 @@ class Session:
         The last run that completed; None before the first.
     image
         The index of the payload that it was computed from; None for one that is not among them.
+    foreign_payloads
+        How many payloads have come from elsewhere, as from a cell.
     is_service
         Whether the functions run in a service: others may set hyperparameters too, whose changes are not to be
         overwritten unseen, and values are written back.
@@ -68,6 +70,7 @@ class Session:
         self.runner, self.payloads = runner, payloads
         self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
+        self.foreign_payloads = 0
         self.image = self._image_of(runner.last, is_alike)
         # Of a graph with state the payloads are a sequence: each begins with what those before it leave.
         self.states: FrameStates | None = None
@@ -216,7 +219,7 @@ class Session:
         is_new = bool(wanted) or image is not None or bool(run.report.ran)
         if is_new and not self.runner.adopt(run):
             return run, False
-        before = self.payload
+        before = () if is_own else self.payload
         with self._lock:
             self.result = run
             for name, value in wanted.items():
@@ -225,8 +228,9 @@ class Session:
                 self._seen[name] = run.hyperparameters[name]
             if image is not None:
                 self.image = image
-            elif len(before) != len(self.payload) or any(map(is_not, before, self.payload)):
+            elif not is_own and (len(before) != len(self.payload) or any(map(is_not, before, self.payload))):
                 self.image = self._image_of(run)
+                self.foreign_payloads += 1
             if self._image_wanted == image:
                 self._image_wanted = None
         self._begun, self._followed = begun, run if is_new else last

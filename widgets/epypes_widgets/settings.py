@@ -7,7 +7,7 @@ import os
 import secrets
 import stat
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +24,7 @@ FORMAT: Final = "epypes settings 1"
 _SUFFIX: Final = ".toml"
 _SECTION: Final = "hyperparameters"
 _PICTURES: Final = "pictures"
+_PANEL: Final = "panel"
 _ABOUT: Final = "Values of hyperparameters, saved by a panel of EPypes. They may be edited; the rest may not."
 _COMMENT_CHARACTERS: Final = 80
 # A longer file, or more reasons, are no settings that a panel has saved.
@@ -37,6 +38,7 @@ def save(
     values: Mapping[str, Any],
     params: Mapping[str, object] | None = None,
     pictures: Mapping[str, PictureSettings] | None = None,
+    tiles: Sequence[str] = (),
 ) -> Path:
     """Write values as TOML, in one step: a file that was there is whole at every moment.
 
@@ -50,6 +52,8 @@ def save(
         By hyperparameter, the ranges and units that stand beside the values.
     pictures
         By token, how its picture is shown; only what is not as at first is written.
+    tiles
+        The tokens whose numbers are shown.
 
     Returns
     -------
@@ -65,7 +69,7 @@ def save(
     reasons = [reason for token, value in values.items() for reason in _unwritable(token, value)]
     if reasons:
         raise SettingsError(file, reasons)
-    text = _document(values, params or {}, pictures or {})
+    text = _document(values, params or {}, pictures or {}, tiles)
     try:
         if file.is_file() and not _is_ours(file):
             raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
@@ -122,6 +126,13 @@ def load_pictures(path: str | Path) -> dict[str, PictureSettings]:
     return found
 
 
+def load_tiles(path: str | Path) -> tuple[str, ...] | None:
+    """Return the tokens whose numbers were shown when a file was saved; None if it does not say."""
+    panel = _read(_with_suffix(path)).get(_PANEL)
+    tiles = panel.get("tiles") if isinstance(panel, dict) else None
+    return tuple(filter(lambda token: isinstance(token, str), tiles)) if isinstance(tiles, list) else None
+
+
 def names(folder: str | Path) -> tuple[str, ...]:
     """Return the names of the settings in a folder, sorted, without ``.toml``; other files are passed over."""
     try:
@@ -168,7 +179,12 @@ def _unwritable(token: str, value: Any) -> Iterator[str]:
         )
 
 
-def _document(values: Mapping[str, Any], params: Mapping[str, object], pictures: Mapping[str, PictureSettings]) -> str:
+def _document(
+    values: Mapping[str, Any],
+    params: Mapping[str, object],
+    pictures: Mapping[str, PictureSettings],
+    tiles: Sequence[str],
+) -> str:
     with optional_import("widgets"):
         import tomlkit
 
@@ -189,6 +205,8 @@ def _document(values: Mapping[str, Any], params: Mapping[str, object], pictures:
     document.add(_SECTION, table)
     if any(each.changed for each in pictures.values()):
         document.add(_PICTURES, tomlkit.item({token: each.changed for token, each in pictures.items() if each.changed}))
+    if tiles:
+        document.add(_PANEL, {"tiles": list(tiles)})
     return tomlkit.dumps(document)
 
 

@@ -13,8 +13,10 @@ from epypes.display.previews.images import image_kind, one_channel, sampled
 from epypes.display.previews.introspection import silent_numpy
 from epypes.graph import colour_order
 from epypes.images import Order
+from epypes.nothing import Nothing
 from epypes.run import Run
 from epypes.run.guard import ARRAYLESS
+from epypes.run.staleness import NOT_COMPUTED
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -81,7 +83,14 @@ def states(run: Run, stages: Stages) -> dict[str, State]:
     ``"failed"`` is what the function that failed would have made, ``"absent"`` what was not computed,
     ``"nothing"`` that for which nothing was found.
     """
-    return {token: _state(run, token) for token in stages}
+    slots, values, makers = run.tokens.program.slots, run.tokens.values, run.tokens.program.makers
+    stale, has_completed, found = run.tokens.stale, run.failure is None, dict[str, State]()
+    for token in stages:
+        value, maker = values[slots[token]], makers[slots[token]]
+        # Most are fresh, and this is asked for each frame.
+        is_fresh = has_completed and maker not in stale and value is not NOT_COMPUTED and value is not Nothing
+        found[token] = "fresh" if is_fresh else _state(run, token)
+    return found
 
 
 def _state(run: Run, token: str) -> State:

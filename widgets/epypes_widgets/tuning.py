@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from math import inf
 from time import perf_counter_ns
 from typing import Any, Final
 
@@ -68,7 +69,7 @@ class Tuning:
         self.is_live = True
         self._settled, self._is_superseded = settled, partial(worker.is_superseded, "compute")
         self._lock = threading.Lock()
-        self._commits = self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
+        self._commits = self._is_forced = self._has_looked = self._is_unwell = False
         self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
         for control in controls.controls:
             control.on_change(self._moved)
@@ -186,8 +187,7 @@ class Tuning:
 
     def seen(self) -> None:
         """Take note that a frame has been painted: what came meanwhile is next."""
-        if self._is_behind:
-            self._request()
+        self.worker.hasten("newer")
 
     def report(self, exception: BaseException) -> None:
         """Say what failed in the panel itself, in its log and in that of the process."""
@@ -276,20 +276,25 @@ class Tuning:
                 self._commit_later(REST_S)
             elif commits:
                 self._commit(is_final=True)
+            elif self._late_tiles(run) and not self.worker.is_pending("commit"):
+                self._commit_later(REST_S)
         self._compare()
 
     def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
         for _ in range(_MAX_ATTEMPTS):
-            run, is_settled = self.session.bring_up_to_date(
-                self.screen.shown.targets,
-                is_wanted=is_wanted,
-                is_superseded=self._is_superseded,
-                report=self.screen.note,
-            )
+            self.screen.tiles.failures.clear()
+            run, is_settled = self._run(self.screen.targets, is_wanted=is_wanted)
+            while self.screen.tiles.is_at_fault(run, self.screen.shown.targets):
+                run, is_settled = self._run(self.screen.targets, is_wanted=is_wanted)
             if is_settled:
                 break
             self._follow_others()
         return run, is_settled
+
+    def _run(self, targets: Sequence[str], *, is_wanted: bool) -> tuple[Run, bool]:
+        return self.session.bring_up_to_date(
+            targets, is_wanted=is_wanted, is_superseded=self._is_superseded, report=self.screen.note
+        )
 
     def _refuse(self, error: Exception) -> None:
         """Say why there is no run."""
@@ -303,10 +308,13 @@ class Tuning:
 
     def _waits_for_screen(self) -> bool:
         """Whether a newer run is to be fetched only when the picture on its way has been painted."""
-        # In this order: when the frame is painted right now, one of the two threads sees what the other has done.
-        self._is_behind = True
-        self._is_behind = self.screen.view.frames.in_flight is not None
-        return self._is_behind
+        frames = self.screen.view.frames
+        if frames.in_flight is None:
+            return False
+        self.worker.post("newer", self._request, inf, is_work=False)
+        if frames.in_flight is None:  # it was painted before that was posted
+            self.worker.hasten("newer")
+        return True
 
     def _show_notice(self) -> None:
         """Say what is wrong with the place where the functions run: the picture may not be the newest."""
@@ -359,6 +367,8 @@ class Tuning:
     def _commit(self, *, is_final: bool = False) -> None:
         """Add the values that the runner has taken over to the history, unless they are there or held."""
         run = self.session.result
+        if run is not None and not self.session.wanted:
+            run = self._with_late_tiles(run)
         if run is None or ((self.session.wanted or self.controls.is_holding) and not is_final):
             return
         self._add(run)
@@ -372,8 +382,37 @@ class Tuning:
         if not len(self.session.payloads) and current is not None:
             image = current.image  # that of another panel on this runner
         token = self.screen.shown.token
-        about = {"picture": thumbnail(run, token, self.screen.shown.limits), "compute_ms": self.screen.compute_ms}
-        self.history.commit(run.hyperparameters, image=image, token=token, **about)
+        numbers = self.screen.tiles.numbers(run)
+        about = {
+            "picture": thumbnail(run, token, self.screen.shown.limits),
+            "compute_ms": self.screen.compute_ms,
+            "numbers": numbers,
+        }
+        if self.history.commit(run.hyperparameters, image=image, token=token, **about) is None and current is not None:
+            current.numbers.update(numbers)
+
+    def _late_tiles(self, run: Run) -> tuple[str, ...]:
+        return self.screen.tiles.late(run, self.screen.pinned_tiles)
+
+    def _with_late_tiles(self, run: Run) -> Run:
+        """Compute and show the tiles that the picture did not wait for; return the run that has them, if any."""
+        tiles, targets = self.screen.tiles, self.screen.shown.targets
+        late = () if self.session.is_service else self._late_tiles(run)
+        if not (late and targets):
+            return run
+        is_at_fault = True
+        while late and is_at_fault:
+            try:
+                whole, is_settled = self._run((*targets, *late), is_wanted=False)
+            except Exception:  # a newer value is wanted, or a placeholder needed: the tiles stay stale
+                return run
+            is_at_fault = tiles.is_at_fault(whole, targets)
+            late = tuple(token for token in late if token not in tiles.failures)
+        if not (is_settled and (is_at_fault or whole.failure is None)):
+            return run
+        shown = run if is_at_fault else whole
+        self.screen.show(shown, 0)
+        return shown
 
     def _compare(self) -> None:
         """Show what the picture is compared with, if that is not part of its own run."""

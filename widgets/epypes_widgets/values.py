@@ -160,7 +160,13 @@ def sendable(text: str) -> str:
 
 def json_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return hyperparameters as JSON has them."""
-    return {name: json_value(value) for name, value in values.items()}
+    # As each frame has them, what is nearly always a number goes the short way.
+    return {
+        name: value
+        if (type(value) is int and abs(value) <= _LARGEST_IN_JSON) or (type(value) is float and abs(value) < math.inf)
+        else json_value(value)
+        for name, value in values.items()
+    }
 
 
 def json_value(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The thread of a panel, and the one place where the latest request wins.
+"""The thread of a panel, and the one place in the kernel where the latest wins: requests, and frames that wait.
 
 A callback of a control must return at once: it may be on the thread that handles the messages of the front end. So a
 request goes into a slot under its key and replaces the one that waits there, and one thread works on them in turn.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from math import inf
 from operator import attrgetter
 from time import monotonic
 from typing import Final, NamedTuple
@@ -81,7 +82,7 @@ class Worker:
         request
             Is called on the worker's thread.
         delay_s
-            Requests without a delay are run first.
+            Requests without a delay are run first; one with an infinite delay waits for ``hasten``.
         is_work
             Whether ``wait`` waits for it.
         """
@@ -95,6 +96,18 @@ class Worker:
                 self._thread.start()
             elif due_s < self._wakes_s:  # to wake the thread for less takes time from a run
                 self._condition.notify_all()
+
+    def hasten(self, key: str) -> bool:
+        """Have the request that waits under a key run without a further delay; return whether there is one."""
+        if key not in self._waiting:
+            return False
+        with self._condition:
+            request = self._waiting.get(key)
+            if request is not None:
+                self._waiting[key] = request._replace(due_s=0.0)
+                if self._wakes_s:
+                    self._condition.notify_all()
+            return request is not None
 
     def wait(self, timeout_s: float) -> None:
         """Return when all work has been done.
@@ -159,7 +172,7 @@ class Worker:
                     self._running = request.key
                     del self._waiting[request.key]
                     return request.call
-                self._wakes_s = now_s + _IDLE_S if request is None else request.due_s
+                self._wakes_s = min(now_s + _IDLE_S, inf if request is None else request.due_s)
                 is_notified = self._condition.wait(self._wakes_s - now_s)
                 self._wakes_s = 0.0
                 if not is_notified and not self._waiting:

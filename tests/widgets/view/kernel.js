@@ -2,6 +2,7 @@
 import view from "/view.js";
 
 const STAGES = ["image", "gray", "blurred", "edges", "n_edges"];
+const NUMBERS = ["n_edges", "mean"];
 const FILTERS = { image: "none", gray: "grayscale(1)", blurred: "grayscale(1) blur(4px)", edges: "grayscale(1) contrast(4) invert(1)" };
 const SIZE = { width: 512, height: 384 };
 const DEFAULTS = { crop: [60, 40, 200, 160], blur_kernel: 5, sigma: 1.5, canny_lo: 70, canny_hi: 200, border: "REFLECT" };
@@ -146,10 +147,12 @@ function histogram(names = ["gray"]) {
   return { low: 0, high: 255, bins: 128, sampled: false, channels: names.map((name, i) => ({ name, counts: bell(40 + 25 * i, 18 + 6 * i) })) };
 }
 
+const tileOf = (token) => ({ token, text: String(kernel.values.canny_lo), change: "+3", state: "fresh", verdict: "passed", title: `${token}: ${kernel.values.canny_lo}` });
+
 /** Everything that a test may look at or change. */
 const kernel = {
   sent: [], values: structuredClone(DEFAULTS), token: "edges", pinned: [], seq: 0, isHistogramOn: false, compared: null, live: true,
-  overlay: null, isQuiet: false, entries: [{ number: 0, values: {}, label: "#0", changed: "", current: true }], image: 0, video: null,
+  overlay: null, tiles: ["n_edges"], isQuiet: false, entries: [{ number: 0, values: {}, label: "#0", changed: "", current: true }], image: 0, video: null,
   defaults: DEFAULTS, bytesOf, pictureOf, histogram, size: SIZE,
   listeners: new Set(), pictures: {}, masks: [],
   models: {},
@@ -165,7 +168,7 @@ const kernel = {
     const message = {
       kind: "frame", seq: kernel.seq, token: kernel.token, values: structuredClone(kernel.values), compute_ms: 2.13, to_screen_ms: 31,
       times_ms: { crop: 0.2, blur: 1.1, canny: 0.8 }, ran: 3, reused: 1, stale: false, image: kernel.image, time_s: kernel.video && kernel.image / 25, pictures: [main],
-      stages: Object.fromEntries(STAGES.map((token) => [token, "fresh"])),
+      stages: Object.fromEntries(STAGES.map((token) => [token, "fresh"])), tiles: kernel.tiles.map(tileOf),
       histogram: kernel.isHistogramOn && !isText ? histogram(kernel.token === "image" ? ["B", "G", "R"] : ["gray"]) : null,
       histograms: kernel.isHistogramOn ? { blurred: histogram() } : {},
     };
@@ -229,7 +232,7 @@ const answers = {
   async ready() {
     const images = kernel.video ? [] : [{ index: 0, title: "coffee" }, { index: 1, title: "coins" }];
     kernel.deliver({
-      kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images,
+      kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images, numbers: NUMBERS,
       video: kernel.video, live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
       promote_to: "services/edges", settings: ["good", "dark"], token: kernel.token, pinned: [], closed: false, pictures: structuredClone(kernel.pictures),
     }, [await bytesOf("image", 96), await bytesOf("gray", 96)]);
@@ -261,7 +264,11 @@ const answers = {
     await kernel.run();
   },
   async stage({ token }) { kernel.token = token; await kernel.run(); },
-  async pin({ token, on }) { kernel.pinned = on ? [...kernel.pinned, token] : kernel.pinned.filter((one) => one !== token); await kernel.run(); },
+  async pin({ token, on }) {
+    const kind = NUMBERS.includes(token) ? "tiles" : "pinned";
+    kernel[kind] = on ? [...kernel[kind], token] : kernel[kind].filter((one) => one !== token);
+    await kernel.run();
+  },
   async histogram({ on }) { kernel.isHistogramOn = on; await kernel.run(); },
   async image({ index }) { kernel.image = index; await kernel.run(); },
   async picture({ token, change }) {

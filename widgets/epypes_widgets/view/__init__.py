@@ -18,6 +18,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
@@ -27,10 +28,13 @@ import anywidget
 import ipywidgets
 
 from epypes_widgets.frames import Frame
+from epypes_widgets.worker import Worker
 
 # Longer than any screen takes to paint; a screen that is gone costs a frame every half minute.
 FIRST_TIMEOUT_S: Final = 2.0
 LAST_TIMEOUT_S: Final = 32.0
+# The keys under which the frame that waits, and the one that may be lost, stand in the worker.
+_NEXT, _LOST = "frame", "lost frame"
 _MAX_TIMES: Final = 200
 _REST_S: Final = 0.3
 _HERE: Final = Path(__file__).parent
@@ -39,7 +43,6 @@ _EXPORT: Final = re.compile(r"^export (?!default)", re.MULTILINE)
 
 Message = Mapping[str, Any]
 Handler = Callable[[Message], object]
-Later = Callable[[str, Callable[[], object], float], None]
 
 
 def script(entry: str = "main.js") -> str:
@@ -106,36 +109,36 @@ class Latency:
 
 
 class FrameSender:
-    """Sends frames one at a time, the newest next; so the screen is never behind by more than one frame.
+    """Sends frames one at a time; so the screen is never behind by more than one frame.
+
+    The newest one that could not be sent yet waits in the worker, like all that is replaced by what is newer.
 
     Parameters
     ----------
     send
         Is called with a frame, on any thread, one call at a time; must not wait for the front end.
-    later
-        Is called with a key, a function and a delay in seconds: the function is to be called once after it, on any
-        thread; a later call of the same key replaces an earlier one.
+    worker
+        Makes the frame that has waited, and one again that was lost.
 
     Attributes
     ----------
     newest
-        The frame that was offered last.
+        The frame that was made last, for a view that is mounted later.
     in_flight
         The frame that was sent and is not acknowledged yet.
 
     Notes
     -----
     Nothing is sent before ``ready``: there is no view yet that could acknowledge it. A frame or an acknowledgement that
-    is lost is made good after a time-out. All methods may be called from any thread.
+    is lost is made good after a time-out. All methods but ``offer`` may be called from any thread.
     """
 
-    def __init__(self, send: Callable[[Frame], None], later: Later) -> None:
-        self._send, self._later = send, later
+    def __init__(self, send: Callable[[Frame], None], worker: Worker) -> None:
+        self._send, self._worker = send, worker
         # Held while sending, so that frames leave in order. An answer within send() on this thread is allowed.
         self._lock = threading.RLock()
         self.newest: Frame | None = None
         self.in_flight: Frame | None = None
-        self._is_waiting = False
         self._views: int | None = None  # none has been mounted yet
         self._timeout_s = FIRST_TIMEOUT_S
 
@@ -149,11 +152,19 @@ class FrameSender:
         """Whether there was a view, and there is none any more."""
         return self._views == 0
 
-    def offer(self, frame: Frame) -> None:
-        """Send a frame now, or when the one in flight has been painted, unless a newer one comes until then."""
+    def offer(self, make: Callable[[], Frame]) -> None:
+        """Make a frame and send it, when the one in flight has been painted, unless a newer one comes until then.
+
+        It is called on the worker's thread, or while that has nothing to do. Once the worker is closed nothing waits.
+        """
         with self._lock:
-            self.newest, self._is_waiting = frame, True
-            self._go_on()
+            if self.in_flight is not None and not self._worker.closed:
+                self._worker.post(_NEXT, partial(self.offer, make), inf, is_work=False)
+                return
+        frame = make()
+        with self._lock:
+            self.newest = frame
+            self._put()
 
     def painted(self, seq: int) -> Frame | None:
         """Take an acknowledgement; return the frame that it was for, None if it was late or came twice."""
@@ -162,20 +173,20 @@ class FrameSender:
             if frame is None or frame.seq != seq:
                 return None
             self.in_flight, self._timeout_s = None, FIRST_TIMEOUT_S
-            self._go_on()
+            self._worker.hasten(_NEXT)
             return frame
 
     def mount(self) -> None:
         """Take note that there is one more view, which is not to get frames yet."""
         with self._lock:
             self._views = (self._views or 0) + 1
-            self._is_waiting, self.in_flight = False, None
+            self.in_flight = None
 
     def ready(self) -> None:
         """Start over with the newest frame: what was in flight may be lost to a view that has just been mounted."""
         with self._lock:
             self._timeout_s = FIRST_TIMEOUT_S
-            self._start_over()
+            self._put()
 
     def closed(self) -> None:
         """Take note that there is one view less; without one nothing is sent.
@@ -187,17 +198,15 @@ class FrameSender:
                 self._views = max(0, self._views - 1)
             if not self._views:
                 self.in_flight = None
+                self._worker.hasten(_NEXT)
 
-    def _start_over(self) -> None:
-        self.in_flight, self._is_waiting = None, self.newest is not None
-        self._go_on()
-
-    def _go_on(self) -> None:
+    def _put(self) -> None:
+        """Send the newest frame if there is a view."""
         frame = self.newest
-        if self._views and self._is_waiting and self.in_flight is None and frame is not None:
-            self.in_flight, self._is_waiting = frame, False
-            # Asked for first: an answer within send() sends the next frame, whose time-out must replace this one.
-            self._later("lost frame", partial(self._overdue, frame), self._timeout_s)
+        if self._views and frame is not None:
+            self.in_flight = frame
+            # Asked for first: an answer within send() may lead to the next frame, whose time-out replaces this one.
+            self._worker.post(_LOST, partial(self._overdue, frame), self._timeout_s, is_work=False)
             self._send(frame)
 
     def _overdue(self, frame: Frame) -> None:
@@ -205,7 +214,9 @@ class FrameSender:
         with self._lock:
             if self.in_flight is frame and self._views:
                 self._timeout_s = min(2 * self._timeout_s, LAST_TIMEOUT_S)
-                self._start_over()
+                self.in_flight = None
+                if not self._worker.hasten(_NEXT):
+                    self._put()
 
 
 class PictureView(anywidget.AnyWidget):
@@ -213,7 +224,7 @@ class PictureView(anywidget.AnyWidget):
 
     Parameters
     ----------
-    later
+    worker
         As for ``FrameSender``.
     failed
         Is called with what a handler has raised.
@@ -230,12 +241,12 @@ class PictureView(anywidget.AnyWidget):
     _esm = script()
     _css = styles()
 
-    def __init__(self, later: Later, failed: Callable[[BaseException], None]) -> None:
+    def __init__(self, worker: Worker, failed: Callable[[BaseException], None]) -> None:
         super().__init__()
         self.handlers: Mapping[str, Handler] = {}
-        self.frames = FrameSender(self._send_frame, later)
+        self.frames = FrameSender(self._send_frame, worker)
         self._to_screen_ms: list[float] = []
-        self._later, self._failed = later, failed
+        self._worker, self._failed = worker, failed
         self.on_msg(self._handle)
 
     def latency(self, compute_ms: float | None) -> Latency:
@@ -283,4 +294,5 @@ class PictureView(anywidget.AnyWidget):
         took_ms = (perf_counter_ns() - frame.changed_ns) / 1e6 + float(message.get("shown_ms", 0))
         self._to_screen_ms = [*self._to_screen_ms, took_ms][-_MAX_TIMES:]
         # A small message right before a frame would hold that frame back, so it waits until the values rest.
-        self._later("latency", lambda: self.tell("latency", {"seq": frame.seq, "to_screen_ms": took_ms}), _REST_S)
+        told = {"seq": frame.seq, "to_screen_ms": took_ms}
+        self._worker.post("latency", partial(self.tell, "latency", told), _REST_S, is_work=False)

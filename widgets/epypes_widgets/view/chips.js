@@ -15,13 +15,14 @@ export function chipsPart(panel) {
   /** @type {Map<string, any>} by token */
   const chips = new Map();
   let pinned = new Set();
+  let tiles = [];
 
-  function make({ token, is_picture }) {
+  function make({ token, is_picture }, numbers) {
     const sign = element("span", "epypes-sign", { "aria-hidden": "true" });
     const kind = is_picture ? "epypes-chip" : "epypes-chip epypes-as-text";
     const chip = button(kind, { role: "tab", "data-token": token, tabindex: "-1", "aria-selected": "false" }, () => panel.chooseStage(token), token, sign);
     const pin = button("epypes-pin", { "aria-pressed": "false", tabindex: "-1" }, () => toggle(token), icon("pin"));
-    const both = element("span", "epypes-chip-box", { role: "presentation" }, chip, is_picture ? pin : null);
+    const both = element("span", "epypes-chip-box", { role: "presentation" }, chip, is_picture || numbers.includes(token) ? pin : null);
     chips.set(token, { chip, pin, sign, both });
     return both;
   }
@@ -66,22 +67,27 @@ export function chipsPart(panel) {
 
   return {
     element: root,
-    setup({ stages, pinned: tokens, token }) {
-      const given = JSON.stringify(stages);
+    setup({ stages, numbers = [], pinned: tokens, token }) {
+      const given = JSON.stringify([stages, numbers]);
       if (root.dataset.given !== given) {
         root.dataset.given = given;
         const focused = document.activeElement?.closest?.(".epypes-chip")?.dataset.token;
         chips.clear();
-        root.replaceChildren(...stages.map(make));
+        root.replaceChildren(...stages.map((stage) => make(stage, numbers)));
         chips.get(focused)?.chip.focus();
       }
-      pinned = new Set(tokens);
+      pinned = new Set([...tokens, ...tiles]);
       showPins();
       select(token);
     },
     frame({ frame }) {
       select(frame.token);
       mark(frame.stages);
+      const now = (frame.tiles ?? []).map((tile) => tile.token);
+      if (now.join() === tiles.join()) return;
+      pinned = new Set([...[...pinned].filter((token) => !tiles.includes(token)), ...now]);
+      tiles = now;
+      showPins();
     },
     select,
   };

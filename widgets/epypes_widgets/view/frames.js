@@ -60,13 +60,14 @@ export function failures() {
 }
 
 /** Shows frames, and writes down what they say beside their picture afterwards, by `panel.describe`. */
-export function framesPart(panel, stage, failed) {
+export function framesPart(panel, stage, tiles, failed) {
   let newest = 0;
   let acknowledged = 0;
 
   function mark(node, frame) {
     node.dataset.seq = String(frame.seq);
     node.dataset.values = JSON.stringify(frame.values);
+    tiles.show(frame);
     stage.text.hidden = node !== stage.text;
     stage.canvas.hidden = node === stage.text;
   }

@@ -18,6 +18,7 @@ import { rowsPart } from "./rows.js";
 import { sizePart } from "./size.js";
 import { stagePart } from "./stage.js";
 import { filmsPart, historyPart, pinnedPart, videoPart } from "./strips.js";
+import { tilesPart } from "./tiles.js";
 
 /** Messages that parts handle in a method of that name. */
 const PASSED_ON = ["latency", "history", "cases", "probe", "settings", "promoted", "written", "optimised", "log"];
@@ -141,16 +142,17 @@ function render({ model, el }) {
   const history = historyPart(panel);
   const optimise = optimisePart(panel);
   const foot = footPart(panel);
-  const frames = framesPart(panel, stage, failed);
-  const parts = [header, bar, chips, rows, pictures, roi, histogram, probe, pinned, films, video, history, optimise, foot];
+  const tiles = tilesPart(panel);
+  const frames = framesPart(panel, stage, tiles, failed);
+  const parts = [header, bar, chips, rows, pictures, roi, histogram, probe, tiles, pinned, films, video, history, optimise, foot];
   const all = (method, ...given) => parts.forEach((part) => part[method]?.(...given));
   stage.panByDrags();
   bar.listen(figure, closing.signal);
   header.element.append(size.wide);
   // Save and Promote are on the screen together with the picture.
   figure.append(
-    bar.element, chips.element, header.element, pictures.element, stage.element, size.handle, header.status, video.element, foot.element,
-    histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element,
+    bar.element, chips.element, header.element, pictures.element, stage.element, size.handle, tiles.element, header.status,
+    video.element, foot.element, histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element,
   );
   el.append(figure);
 
@@ -181,7 +183,7 @@ function render({ model, el }) {
     all("setup", message, buffers);
     // What asks the kernel to compute rests with a panel that is closed; its picture can still be looked at.
     const column = figure.closest(".epypes-panel")?.querySelector(".epypes-controls");
-    const asking = [column, chips.element, pinned.element, films.element, video.element, history.element, optimise.element, ...foot.asking];
+    const asking = [column, chips.element, tiles.asking, pinned.element, films.element, video.element, history.element, optimise.element, ...foot.asking];
     for (const node of asking) if (node) node.inert = Boolean(message.closed);
   }
 
