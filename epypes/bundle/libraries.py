@@ -19,9 +19,11 @@ import hashlib
 import inspect
 import sys
 import types
+from abc import ABCMeta
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any, Final
 
+from epypes.bundle.objects import registered_classes
 from epypes.bundle.process_settings import OF_NOTEBOOKS
 from epypes.run.snapshot import is_own
 
@@ -93,12 +95,18 @@ def changed_attributes(
                 # Not what a loop over a set has left behind in a module, nor what libraries do to each other.
                 is_changed = last.isupper() or "." in name or last in mentioned or f".{last}" in other
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
+                is_changed &= "." not in name or not _is_object_of(module, value, other)
                 is_changed |= last in named_here
                 is_changed &= other != value and (other != "None" or last in named_here)
                 is_changed &= not value.startswith(OF_NOTEBOOKS)
             if is_changed:
                 found[module, name] = value, other
     return found
+
+
+def _is_object_of(module: str, *values: str) -> bool:
+    """Whether these describe objects or classes of a module's own package, as its own functions exchange them."""
+    return all(value.startswith(f"{module.partition('.')[0]}.") and " " not in value for value in values)
 
 
 def _mentioned(text: str) -> set[str]:
@@ -122,6 +130,9 @@ def _attributes(owner: Any, home: str, prefix: str = "") -> Iterator[tuple[str, 
             continue
         yield f"{prefix}{name}", _described(value)
         if isinstance(value, type) and value.__module__ == home and value.__qualname__ == f"{prefix}{name}":
+            if isinstance(value, ABCMeta):
+                own = [one.__qualname__ for one in registered_classes(value) if is_own(one.__module__)]
+                yield f"{prefix}{name}.register", f"own classes {sorted(set(own))}"
             yield from _attributes(value, home, f"{prefix}{name}.")
         elif type(value) is dict and len(value) <= _MOST_ENTRIES:
             entries = ((key, entry) for key, entry in value.items() if type(key) in (str, int))

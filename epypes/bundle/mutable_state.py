@@ -15,8 +15,11 @@ closure holds it. What can't be compared is forgotten or put back after each cal
 property has computed, a cache that is held elsewhere, and the attributes of a node of the user's own class, which may
 count its calls. A function that reaches one of these never runs beside another one.
 
-A background model or a filter of OpenCV that outlives the call counts as changed. What a pipeline of the user's own
-class has in its attributes is not looked at.
+An object of a library is compared by its attributes, also private ones: what it computes when it is first asked is put
+back without a failure. One that keeps its content in C is compared by what pickle writes of it, one of OpenCV by what
+its getters return. What none of these can read, such as a background model or a hash, counts as changed whatever the
+call does, so that promotion refuses what refers to it. What a pipeline of the user's own class has in its attributes is
+not looked at.
 
 How Python and libraries are set, and the variables of the context, are compared after each call of the user's
 functions. What a call sets in its context is gone with that; what else it has set is put back. What the code could
@@ -37,10 +40,11 @@ from __future__ import annotations
 import dis
 import functools
 import itertools
+import pickle
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar, copy_context
 from enum import Enum
@@ -72,6 +76,7 @@ from epypes.run.snapshot import (
     as_dict,
     cached_properties,
     is_global_generator,
+    is_numpy_scalar,
     is_own,
     is_same,
 )
@@ -93,6 +98,17 @@ _BINDS: Final = frozenset(
 _UNLOCKS: Final = frozenset(
     {"setflags", *(f"STORE_ATTR {name}" for name in ("writeable", "shape", "dtype", "strides", "data"))}
 )
+# Code with one of these notices that an array is locked, and may go on: its arrays are compared instead.
+_NOTICES_LOCKS: Final = frozenset({"except", "suppress", "__exit__", "exception", "flags"})
+# Inference sessions are too large to compare, and their weights change where they are trained alone.
+_OF_NETWORKS: Final = frozenset({"onnxruntime", "openvino", "tensorflow", "tflite_runtime", "torch"})
+# Objects that Python hands on, such as partials, patterns and locks: what they hold is looked at, or never changes.
+_HANDED_ON: Final = frozenset(
+    {"_contextvars", "_operator", "_thread", "_weakref", "builtins", "contextvars", "datetime", "epypes", "functools"}
+    | {"operator", "re", "threading", "types", "typing", "weakref", "zoneinfo"}
+)
+# How a class of a library says what pickle writes of its objects.
+_PICKLING: Final = ("__getstate__", "__reduce__", "__reduce_ex__")
 # Python makes these itself when they are first asked for; an Enum adds combinations of its members then.
 _OF_PYTHON: Final = frozenset(
     {"__builtins__", "__warningregistry__", "__dict__", "__weakref__", "__doc__", "__abstractmethods__", "_abc_impl"}
@@ -159,15 +175,24 @@ class CodeSnapshot(Snapshot):
         return bool(self.records or self.resets or self._caches)
 
     def changed(self) -> str | None:
-        """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
+        """Return the first object that has changed, by the name that the code knows it by; None if there is none.
+
+        It is "" where libraries alone have computed something that is put back without a failure.
+        """
+        is_quiet = False
         for record in self.records:
             if record.differs():
-                return record.changed_name() if isinstance(record, _Bindings) else record.name
+                name = record.changed_name() if isinstance(record, _Bindings) else record.name
+                if name:
+                    return name
+                is_quiet = True
         for name, _, values in self._caches:
             for value in values:
-                if value.changed() is not None:
+                changed = value.changed()
+                if changed:
                     return name
-        return None
+                is_quiet |= changed is not None
+        return "" if is_quiet else None
 
     def reset(self) -> None:
         """Put back or forget what a call may change without a failure."""
@@ -223,12 +248,29 @@ class CodeSnapshot(Snapshot):
                 self._compare(_BINDS, functools.partial(_Bindings, f"{kind.__name__}.{value.name}.", value))
         elif kind is Logger:
             self.records.append(_Bindings(f"{name}.", value))
-        elif is_model_of_cv2(value):
-            self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
             # A library's own code may not take read-only arrays.
             self._compared.update((id(part), part) for part in attributes.values() if is_array(part))
+        known = len(self.records)
         yield from super().look_at(name, value)
+        if _may_hide(value) and (type(attributes) is dict or len(self.records) == known):
+            yield from self._look_at_hidden(name, value)
+
+    def _look_at_hidden(self, name: str, value: Any) -> Found:
+        """Look at what an object of a library has in private attributes, or where Python can't see it."""
+        kind, attributes = type(value), getattr(value, "__dict__", None)
+        is_of_cv2 = str(kind.__module__).partition(".")[0] == "cv2"
+        if is_of_cv2 and not is_model_of_cv2(value):
+            self.records.append(_Content(name, value, _read_getters, _leave))
+            self._compare(_unreadable_setters(kind), functools.partial(_Content, name, value, _always_another, _leave))
+        elif not is_of_cv2 and _pickled(value) and (type(attributes) is not dict or _has_pickling(kind)):
+            self.records.append(_Content(name, value, _pickled, _leave))
+        elif type(attributes) is dict:
+            record = _HiddenAttributes(f"{name}.", value, self.words)
+            self.records.append(record)
+            yield from ((name, part) for part in as_dict(record.saved).values())
+        else:
+            self.records.append(_Content(name, value, _always_another, _leave))
 
     def look_at_array(self, name: str, value: Any) -> Found:
         """Lock an array, instead of making a copy of it to compare with."""
@@ -268,13 +310,15 @@ class CodeSnapshot(Snapshot):
 
     def _note_instructions(self, code: types.CodeType) -> None:
         """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
-        self.has_code = True
+        self.has_code, handlers = True, 0
         self.words.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
+            handlers += {"PUSH_EXC_INFO": 1, "WITH_EXCEPT_START": -1}.get(operation, 0)
             if operation.startswith(("STORE_", "DELETE_")):
                 is_free = operation.endswith("_DEREF") and name in code.co_freevars
                 self.words |= {operation, f"{operation} {name}", *(["nonlocal"] if is_free else [])}
+        self.words |= {"except"} if handlers > 0 else set()
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):
@@ -340,9 +384,74 @@ class CodeSnapshot(Snapshot):
         self._possible.append((needed, lambda: self.records.append(make())))
 
 
+def _may_hide(value: Any) -> bool:
+    """Whether a value is an object of a library, which may have content that no other way of comparing sees."""
+    kind = type(value)
+    home = str(kind.__module__).partition(".")[0]
+    if is_own(str(kind.__module__)) or home in _HANDED_ON | _OF_NETWORKS or is_numpy_scalar(kind):
+        return False
+    is_container = isinstance(value, tuple | list | dict | set | Logger | Enum) or is_array(value)
+    is_of_pandas = home == "pandas" and hasattr(value, "equals")
+    is_executor = any(base.__name__ in ("Executor", "dnn_Net") for base in kind.__mro__)
+    return not (is_container or is_of_pandas or is_executor or (callable(value) and hasattr(value, "__name__")))
+
+
+class _Content(Record):
+    """The content of an object as a copy, which can't be put back."""
+
+    __slots__ = ()
+
+
+def _leave(value: Any, saved: object) -> None:
+    """Leave an object as it is: what it holds can't be set."""
+
+
 def _always_another(value: Any) -> tuple[object, ...]:
     """Return contents that differ from those of any other call."""
     return (object(),)
+
+
+def _has_pickling(kind: type) -> bool:
+    """Whether a class says itself what pickle writes of its objects."""
+    return any(getattr(kind, name, None) is not getattr(object, name, None) for name in _PICKLING)
+
+
+def _pickled(value: Any) -> tuple[bytes, ...]:
+    """Return what pickle writes of an object; nothing if it can't."""
+    try:
+        return (pickle.dumps(value, pickle.HIGHEST_PROTOCOL),)
+    except Exception:  # whatever an object raises that can't be pickled
+        return ()
+
+
+def _getters(kind: type) -> list[str]:
+    """Return the methods and attributes of a class of OpenCV that may say what its objects hold."""
+    slots = (name for name in dir(kind) if isinstance(getattr(kind, name), types.GetSetDescriptorType))
+    return [*(name for name in dir(kind) if name.startswith(("get", "is")) or name == "empty"), *slots]
+
+
+def _unreadable_setters(kind: type) -> frozenset[str]:
+    """Return the methods of a class of OpenCV that set what no getter returns."""
+    known = {name.removeprefix("get").lower() for name in _getters(kind)}
+    return frozenset(name for name in dir(kind) if name.startswith("set") and name[3:].lower() not in known)
+
+
+def _read_getters(value: Any) -> tuple[Any, ...]:
+    found: list[Any] = []
+    for name in _getters(type(value)):
+        with suppress(Exception):  # what takes arguments, or is not there yet
+            part = getattr(value, name)
+            found.append((name, _plain(part() if callable(part) else part)))
+    return tuple(found)
+
+
+def _plain(value: Any) -> Any:
+    """Return what a getter has returned as values that can be compared."""
+    if is_array(value):
+        return value.shape, value.tobytes()
+    if isinstance(value, tuple | list):
+        return tuple(map(_plain, value))
+    return _read_getters(value) if type(value).__module__[:3] == "cv2" else value
 
 
 def _forget(value: Any, lazy: frozenset[str]) -> None:
@@ -390,6 +499,43 @@ class _Bindings(Record):
             and not is_same(after.get(name, self), before.get(name, self))
             and not (isinstance(after.get(name), types.ModuleType) and before.get(name) is None)
         ]
+
+
+class _HiddenAttributes(_Bindings):
+    """The private attributes of a library's object.
+
+    What begins as None or False, or is not there, the library computes when it is first asked, unless the user's code
+    sets it: that is put back without a failure.
+    """
+
+    __slots__ = ("words",)
+
+    def __init__(self, name: str, value: Any, words: Collection[str]) -> None:
+        self.words = words
+        Record.__init__(self, name, value, _read_private, _write_private)
+
+    def changed_name(self) -> str:
+        """Return what has another value, "" if the library has computed all of it."""
+        before = as_dict(self.saved)
+        loud = (
+            name
+            for name in self._others(self.read(self.value))
+            if before.get(name) not in (None, False) or f"STORE_ATTR {name}" in self.words
+        )
+        return next((f"{self.name}{name}" for name in loud), "")
+
+
+def _read_private(value: Any) -> tuple[Any, ...]:
+    lazy = cached_properties(type(value))
+    found = {name: part for name, part in vars(value).items() if name[:1] == "_" and name not in lazy}
+    return *found, *found.values()
+
+
+def _write_private(value: Any, saved: tuple[Any, ...]) -> None:
+    before = as_dict(saved)
+    for name in as_dict(_read_private(value)).keys() - before.keys():
+        del vars(value)[name]
+    vars(value).update(before)
 
 
 class _LibraryBindings(_Bindings):
@@ -505,7 +651,7 @@ def _checked(cached: Any) -> Any:
 
     def compute(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        snapshot = CodeSnapshot({"": result}, {})  # locks its arrays
+        snapshot = CodeSnapshot({"its value": result}, {})  # locks its arrays
         if snapshot:
             if len(values) >= _MOST_VALUES:
                 made.cache_clear()
@@ -547,9 +693,11 @@ class MutableState:
         # The nodes, also of pipelines, that functions refer to and may call themselves, by id.
         self._referred: dict[int, Node] = {}
         for name, function in _with_inner(functions):
-            if is_unguarded(function):
-                # It rejects read-only arrays.
-                CodeSnapshot({name: function}, self._compared, lock=False)
+            found: dict[int, object] = {}
+            words = CodeSnapshot({name: function}, found, lock=False).words
+            if is_unguarded(function) or _NOTICES_LOCKS & words:
+                # It rejects read-only arrays, or may go on without what it would write.
+                self._compared.update(found)
 
     def guarded(self, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
         """Have runners and nodes call what compares the state of these functions; return them, odd kinds wrapped.
@@ -655,7 +803,8 @@ def _attempt(
         snapshot.reset()
         changed = snapshot.changed()
     try:
-        return result, error, settings.changed(context, modules) if changed is None else changed
+        found = None if changed else settings.changed(context, modules)
+        return result, error, changed if found is None else found
     finally:
         # The exception refers to this frame, which refers to the exception, and to the images of the call.
         del error, result

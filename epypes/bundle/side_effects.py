@@ -153,9 +153,13 @@ def check_notebook_name(name: str, found: Definition) -> None:
 
 
 # By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
-_REFLECTING: Final = (builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack)
+_REFLECTING: Final = (
+    *(builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack),
+    *(inspect.getfile, inspect.getmodule, inspect.getsource, inspect.getsourcefile, inspect.getsourcelines),
+)
 _REFLECTING_ATTRIBUTES: Final = frozenset(
-    {"__globals__", "__builtins__", "f_globals", "f_locals", "f_builtins", "f_back"}
+    {"__globals__", "__builtins__", "__subclasses__", "f_globals", "f_locals", "f_builtins", "f_back", "f_lineno"}
+    | {"tb_lineno", "co_filename", "co_firstlineno", "__firstlineno__", "co_name", "co_qualname"}
 )
 
 
@@ -236,7 +240,8 @@ def _is_patched(owner: Any, name: str) -> bool:
     """Whether a module has a function, class or mock of the notebook, in whatever way that was put there."""
     value = vars(owner).get(name) if isinstance(owner, types.ModuleType) and owner.__name__ != "__main__" else None
     is_own = isinstance(value, types.FunctionType) and value.__globals__.get("__name__") == "__main__"
-    homes = (getattr(value, "__module__", ""), type(value).__module__)
+    is_mocks = isinstance(owner, types.ModuleType) and owner.__name__ == "unittest.mock"
+    homes = () if is_mocks else (getattr(value, "__module__", ""), type(value).__module__)
     return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
 
 
