@@ -53,8 +53,16 @@ from typing import Any, Final
 
 from epypes.bundle.libraries import OF_THE_PROCESS
 from epypes.bundle.private_import import import_module, plain_name
-from epypes.bundle.process_settings import GlobalGenerators, ProcessSettings, is_setting
+from epypes.bundle.process_settings import (
+    DRAWING_METHODS,
+    GlobalGenerators,
+    ProcessSettings,
+    are_drawn_by,
+    draws_or_seeds,
+    is_setting,
+)
 from epypes.bundle.references import (
+    attributes_loaded,
     cells_of,
     defaults_of,
     global_names,
@@ -67,7 +75,7 @@ from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.pipeline.node import wrap_calls
-from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
+from epypes.run.guard import WATCH, WRITTEN, as_written, is_array, is_unguarded
 from epypes.run.snapshot import (
     Found,
     Record,
@@ -100,6 +108,11 @@ _UNLOCKS: Final = frozenset(
 )
 # Code with one of these notices that an array is locked, and may go on: its arrays are compared instead.
 _NOTICES_LOCKS: Final = frozenset({"except", "suppress", "__exit__", "exception", "flags"})
+# Code with one of these may set something for the whole process until it is done: it never runs beside another call.
+_SETS_FOR_A_WHILE: Final = frozenset(
+    {"chdir", "environ", "field_size_limit", "option_context", "patch", "rcParams", "rc_context", "redirect_stderr"}
+    | {"redirect_stdout", "register_dialect", "reset_option", "set_option", "setfirstweekday", "setlocale"}
+)
 # Inference sessions are too large to compare, and their weights change where they are trained alone.
 _OF_NETWORKS: Final = frozenset({"onnxruntime", "openvino", "tensorflow", "tflite_runtime", "torch"})
 # Objects that Python hands on, such as partials, patterns and locks: what they hold is looked at, or never changes.
@@ -149,6 +162,8 @@ class CodeSnapshot(Snapshot):
         The nodes and pipelines that were met, by id.
     words
         The names that the code has, its instructions, and the names of the libraries whose objects it names.
+    draws, seeds
+        The functions of the random generators of the whole process by which the code draws, and whether it seeds one.
     has_code
         Whether code of the user was met.
     """
@@ -159,6 +174,8 @@ class CodeSnapshot(Snapshot):
         self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
         self.words: set[str] = set()
+        self.draws: set[str] = set()
+        self.seeds = False
         self.has_code = False
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
@@ -216,8 +233,7 @@ class CodeSnapshot(Snapshot):
         """Look into code too."""
         kind = type(value)
         home = value.__name__ if kind is types.ModuleType else getattr(value, "__module__", None)
-        if is_global_generator(getattr(value, "__self__", None)):
-            self.words.add("random")
+        self._note_draw(value)
         if isinstance(home, str):
             top = home.partition(".")[0]
             self.words |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
@@ -292,6 +308,8 @@ class CodeSnapshot(Snapshot):
         self._compare(_BINDS, functools.partial(_Bindings, f"{function.__name__}.", function))
         for inner in nested_codes(code):
             self._note_instructions(inner)
+        for part in attributes_loaded(function):
+            self._note_draw(part)
         yield from meanings_of(function, global_names(code)).items()
         for name in imported_modules(function):
             # A module of the bundle is imported now: what it holds when a call imports it could not be put back.
@@ -307,6 +325,12 @@ class CodeSnapshot(Snapshot):
         yield from defaults_of(function).items()
         attributes = function.__dict__.items()
         yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
+
+    def _note_draw(self, value: Any) -> None:
+        """Note a function that draws from a random generator of the whole process, or seeds it."""
+        is_draw, is_seed = draws_or_seeds(value)
+        self.draws |= {value.__name__} if is_draw else set()
+        self.seeds |= is_seed
 
     def _note_instructions(self, code: types.CodeType) -> None:
         """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
@@ -393,7 +417,8 @@ def _may_hide(value: Any) -> bool:
     is_container = isinstance(value, tuple | list | dict | set | Logger | Enum) or is_array(value)
     is_of_pandas = home == "pandas" and hasattr(value, "equals")
     is_executor = any(base.__name__ in ("Executor", "dnn_Net") for base in kind.__mro__)
-    return not (is_container or is_of_pandas or is_executor or (callable(value) and hasattr(value, "__name__")))
+    is_known = is_container or is_of_pandas or is_executor or is_global_generator(value)
+    return not is_known and not (callable(value) and hasattr(value, "__name__"))
 
 
 class _Content(Record):
@@ -667,6 +692,21 @@ def _checked(cached: Any) -> Any:
     return made
 
 
+def draws_without_seed(functions: Mapping[str, Any]) -> list[str]:
+    """Return for each function that draws random numbers after another one's seed why events could mix them up."""
+    written = {name: as_written(function) for name, function in _with_inner(functions)}
+    found = {name: CodeSnapshot({name: function}, {}, lock=False) for name, function in written.items()}
+    draws = {name: snapshot.draws | DRAWING_METHODS & snapshot.words for name, snapshot in found.items()}
+    seeding = next((name for name, snapshot in found.items() if snapshot.seeds), "")
+    return [
+        f"Function {name!r} draws by {min(draws[name])!r} from a random generator of the whole process, which "
+        f"function {seeding!r} seeds: events on other threads draw from it in between. Seed it in {name!r}, or draw "
+        "from np.random.default_rng(seed)."
+        for name, snapshot in found.items()
+        if seeding and draws[name] and not snapshot.seeds
+    ]
+
+
 # -- calls ---------------------------------------------------------------------------------------------------------
 
 # The lock that a guarded call in this context holds. What that calls is part of it, also in a runner's helper threads.
@@ -739,8 +779,8 @@ class MutableState:
         self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
     ) -> Callable[..., Any]:
         lock, referred, settings = self._lock, self._referred, self._settings
-        draws = self._generators.are_drawn_by(snapshot.words)
-        has_resets = draws or bool(snapshot.resets)
+        draws = bool(snapshot.draws) or snapshot.seeds or are_drawn_by(snapshot.words)
+        has_resets = draws or bool(snapshot.resets) or not _SETS_FOR_A_WHILE.isdisjoint(snapshot.words)
         attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
         @functools.wraps(function)
