@@ -94,6 +94,8 @@ _CACHED: Final = type(functools.cache(len))
 _CHECKED: Final = "__epypes_checked__"
 # An attribute of that one: the snapshots of its mutable values.
 _VALUES: Final = "__epypes_values__"
+# Another: the names that the code has which may ask for its values.
+_WORDS: Final = "__epypes_words__"
 # A cache is emptied when it has more values than this that must be compared at each call.
 _MOST_VALUES: Final = 1_000
 # Code with one of these names or instructions can bind names of its module, of closures, or attributes; code with one
@@ -153,6 +155,8 @@ class CodeSnapshot(Snapshot):
         The arrays that are not locked but compared, by id; those of libraries' objects are added.
     lock
         Whether all others are locked; else they are added too.
+    words
+        Names that the code has which gets the values, besides those that are met.
 
     Attributes
     ----------
@@ -168,12 +172,19 @@ class CodeSnapshot(Snapshot):
         Whether code of the user was met.
     """
 
-    def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
+    def __init__(
+        self,
+        functions: Mapping[str, object],
+        compared: dict[int, object],
+        *,
+        lock: bool = True,
+        words: Collection[str] = (),
+    ) -> None:
         self._compared, self._lock = compared, lock
         self.resets: list[Callable[[], object]] = []
         self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
-        self.words: set[str] = set()
+        self.words: set[str] = {*words}
         self.draws: set[str] = set()
         self.seeds = False
         self.has_code = False
@@ -186,6 +197,8 @@ class CodeSnapshot(Snapshot):
             if needed & self.words:
                 add()
         self._possible.clear()
+        for _, cached, _ in self._caches:
+            vars(cached).setdefault(_WORDS, set()).update(self.words)
         self._compare_libraries()
 
     def __bool__(self) -> bool:
@@ -676,7 +689,8 @@ def _checked(cached: Any) -> Any:
 
     def compute(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        snapshot = CodeSnapshot({"its value": result}, {})  # locks its arrays
+        words = vars(made).get(_WORDS, frozenset())
+        snapshot = CodeSnapshot({"its value": result}, {}, lock=not _NOTICES_LOCKS & words, words=words)
         if snapshot:
             if len(values) >= _MOST_VALUES:
                 made.cache_clear()
@@ -734,8 +748,8 @@ class MutableState:
         self._referred: dict[int, Node] = {}
         for name, function in _with_inner(functions):
             found: dict[int, object] = {}
-            words = CodeSnapshot({name: function}, found, lock=False).words
-            if is_unguarded(function) or _NOTICES_LOCKS & words:
+            snapshot = CodeSnapshot({name: function}, found, lock=False)
+            if is_unguarded(function) or _NOTICES_LOCKS & snapshot.words:
                 # It rejects read-only arrays, or may go on without what it would write.
                 self._compared.update(found)
 
