@@ -137,7 +137,7 @@ _OF_A_LOGGER: Final = frozenset(vars(Logger("")))  # noqa: LOG001 - one that nob
 _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
 # Py_TPFLAGS_HEAPTYPE: a class with this flag is no static one of C, which takes no attributes.
 _MADE_BY_PYTHON: Final = 1 << 9
-_SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
+_SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal", "_csv": "csv"}
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
 

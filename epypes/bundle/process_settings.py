@@ -250,14 +250,14 @@ SETTINGS: Final = (
     _of_functions(
         "scipy.special.seterr",
         "geterr",
-        "seterr",
+        "seterr special",
         by_keyword=True,
         texts=lambda errors: {"scipy.special.seterr": f"{sorted(one for one in errors if errors[one] == 'raise')}"},
     ),
     _of_functions(
         "calendar.setfirstweekday",
         "firstweekday",
-        "setfirstweekday",
+        "calendar",
         texts=lambda day: {"calendar.setfirstweekday": f"{int(day)}"},
     ),
     Setting(
@@ -265,7 +265,7 @@ SETTINGS: Final = (
         "csv",
         operator.attrgetter("field_size_limit"),
         lambda csv, size: csv.field_size_limit(size),
-        frozenset({"field_size_limit"}),
+        frozenset({"csv"}),
         lambda size: {"csv.field_size_limit": f"{size}"},
     ),
     Setting(
@@ -273,7 +273,7 @@ SETTINGS: Final = (
         "csv",
         lambda csv: lambda: {name: csv.get_dialect(name) for name in csv.list_dialects()},
         _set_dialects,
-        frozenset({"register_dialect", "unregister_dialect"}),
+        frozenset({"csv"}),
         lambda dialects: {"csv.register_dialect": f"{sorted(dialects)}"},
     ),
     Setting(

@@ -49,7 +49,7 @@ REFUSED = {
     "mask of new files": ("from os import umask as mask\ndef f(x):\n    return mask(0) if x > 100 else 0", r"'mask' \(cell \[2\], line 3\)"),
     "logging": ("def f(x):\n    import logging\n    if x > 100: logging.disable(50)\n    return x", r"'logging\.disable' \(cell \[2\], line 3\)"),
     "OpenCL": ("def f(x):\n    if x > 100: cv2.ocl.setUseOpenCL(False)\n    return cv2.ocl.useOpenCL()", r"'cv2\.ocl\.setUseOpenCL'"),
-    "setter in a table": ("import os\nT = {'a': os.umask}\ndef f(x):\n    return T['a'](0) if x > 100 else 0", r"'os\.umask', which sets something"),
+    "setter in a table": ("import os\nT = {'a': os.umask}\ndef f(x):\n    return T['a'](0) if x > 100 else 0", r"'posix\.umask', which sets something"),
 }  # fmt: skip
 
 # By name: a cell with a function f whose last run is promoted, and words of the reason why it is refused.
