@@ -39,6 +39,7 @@ from epypes.bundle.objects import (
     describe,
     is_installed,
     is_of_library,
+    is_unset,
     module_reads,
     without_nodes,
 )
@@ -258,6 +259,12 @@ class _Walk:
             names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         parts, others_parts = dict(mine.parts), dict(others.parts)
+        if mine.is_pickled:
+            lazy = _computed_lazily(parts[" state"], others_parts[" state"])
+            parts[" state"], others_parts[" state"] = (
+                {name: part for name, part in side[" state"].items() if name not in lazy} if lazy else side[" state"]
+                for side in (parts, others_parts)
+            )
         self._add_all(path, _without(parts, left_out), _without(others_parts, left_out))
         self._asked.append((_ANNOTATIONS, path, _annotations_in(parts), _annotations_in(others_parts)))
         self._compare_names(path, ours, theirs)
@@ -379,6 +386,13 @@ def _texts_made_of(node: ast.AST) -> list[ast.expr]:
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mod):
         written = node.right.elts if isinstance(node.right, ast.Tuple) else [node.right]
     return written
+
+
+def _computed_lazily(ours: Any, theirs: Any) -> set[str]:
+    """Return the private attributes of a library's object that it has computed in the notebook, and not yet here."""
+    if type(ours) is not dict or type(theirs) is not dict:
+        return set()
+    return {name for name in {**ours, **theirs} if str(name)[:1] == "_" and is_unset(theirs.get(name))}
 
 
 def _has_nan(key: Any) -> bool:

@@ -39,6 +39,7 @@ from __future__ import annotations
 
 import dis
 import functools
+import gc
 import itertools
 import pickle
 import sys
@@ -52,6 +53,7 @@ from logging import Logger
 from typing import Any, Final
 
 from epypes.bundle.libraries import OF_THE_PROCESS
+from epypes.bundle.objects import is_unset
 from epypes.bundle.private_import import import_module, plain_name
 from epypes.bundle.process_settings import (
     DRAWING_METHODS,
@@ -280,9 +282,11 @@ class CodeSnapshot(Snapshot):
         elif not is_array(value) and type(attributes) is dict:
             # A library's own code may not take read-only arrays.
             self._compared.update((id(part), part) for part in attributes.values() if is_array(part))
-        known = len(self.records)
+        known, may_hide = len(self.records), _may_hide(value)
+        if may_hide:
+            self._compared.update((id(part), part) for part in gc.get_referents(value) if is_array(part))
         yield from super().look_at(name, value)
-        if _may_hide(value) and (type(attributes) is dict or len(self.records) == known):
+        if may_hide and (type(attributes) is dict or len(self.records) == known):
             yield from self._look_at_hidden(name, value)
 
     def _look_at_hidden(self, name: str, value: Any) -> Found:
@@ -558,7 +562,7 @@ class _HiddenAttributes(_Bindings):
         loud = (
             name
             for name in self._others(self.read(self.value))
-            if before.get(name) not in (None, False) or f"STORE_ATTR {name}" in self.words
+            if not is_unset(before.get(name)) or f"STORE_ATTR {name}" in self.words
         )
         return next((f"{self.name}{name}" for name in loud), "")
 

@@ -384,6 +384,11 @@ def _without_computed(kind: type, state: Any) -> Any:
     )
 
 
+def is_unset(value: Any) -> bool:
+    """Whether this is what a private attribute begins with that a library computes when it is first asked."""
+    return value is None or value is False
+
+
 _VECTORIZE: Final = ("numpy", "vectorize")
 
 
