@@ -466,21 +466,23 @@ def _pickled(value: Any) -> tuple[bytes, ...]:
         return ()
 
 
-def _getters(kind: type) -> list[str]:
+@functools.cache
+def _getters(kind: Any) -> list[str]:
     """Return the methods and attributes of a class of OpenCV that may say what its objects hold."""
     slots = (name for name in dir(kind) if isinstance(getattr(kind, name), types.GetSetDescriptorType))
     return [*(name for name in dir(kind) if name.startswith(("get", "is")) or name == "empty"), *slots]
 
 
-def _unreadable_setters(kind: type) -> frozenset[str]:
+def _unreadable_setters(kind: Any) -> frozenset[str]:
     """Return the methods of a class of OpenCV that set what no getter returns."""
     known = {name.removeprefix("get").lower() for name in _getters(kind)}
     return frozenset(name for name in dir(kind) if name.startswith("set") and name[3:].lower() not in known)
 
 
 def _read_getters(value: Any) -> tuple[Any, ...]:
+    kind: Any = type(value)
     found: list[Any] = []
-    for name in _getters(type(value)):
+    for name in _getters(kind):
         with suppress(Exception):  # what takes arguments, or is not there yet
             part = getattr(value, name)
             found.append((name, _plain(part() if callable(part) else part)))
