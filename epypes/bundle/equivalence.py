@@ -222,8 +222,8 @@ class _Walk:
                 where, elsewhere = _side(side == 0), _side(side == 1)
                 text = f"{path.name} is one object in the {where} and several in the {elsewhere}"
                 if is_atom:
-                    text = f"{text}, and NaN is found and compared by its identity. Use np.nan."
-                    self._last = self._last or _Different(path, text)
+                    nan = _Different(path, f"{text}, and NaN is found and compared by its identity. Use np.nan.")
+                    self._last = self._last or nan
                 text = f"{text}, and a function compares by 'is' or 'in', or copies deeply."
                 self._divided.setdefault(has_equals, _Different(path, text))
 
