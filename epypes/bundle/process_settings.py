@@ -378,7 +378,9 @@ class ProcessSettings:
 def draws_or_seeds(value: Any) -> tuple[bool, bool]:
     """Return whether a function draws from a random generator of the whole process, and whether it seeds one."""
     name = getattr(value, "__name__", "")
-    is_method = is_global_generator(getattr(value, "__self__", None))
+    # Three functions of numpy.random are no methods of its generator.
+    is_function = name in ("seed", "ranf", "sample") and value is getattr(sys.modules.get("numpy.random"), name, None)
+    is_method = is_function or is_global_generator(getattr(value, "__self__", None))
     is_of_cv2 = name in _DRAWS_OF_CV2 | _SEEDS and value is getattr(sys.modules.get("cv2"), name, None)
     is_seed = (is_method or is_of_cv2) and name in _SEEDS
     return (is_method or is_of_cv2) and not is_seed, is_seed

@@ -207,6 +207,19 @@ def _check_setters(found: Definition, names: Mapping[str, Any]) -> None:
                 raise _setter(found.what, f"{ast.unparse(read)!r} ({found.place_in(node)})")
 
 
+def _check_mocks(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that patches by ``unittest.mock`` but in a 'with' statement, which undoes it."""
+    parts = [*ast.walk(ast.Module([*found.node.body], []))]
+    calls = [item.context_expr for part in parts if isinstance(part, ast.With) for item in part.items]
+    undone = {id(part) for call in calls if isinstance(call, ast.Call) for part in ast.walk(call.func)}
+    for node in parts:
+        value = evaluated(node, names) if isinstance(node, ast.Name | ast.Attribute) else None
+        is_patch = getattr(value, "__module__", "") == "unittest.mock" and "patch" in getattr(value, "__name__", "")
+        if is_patch and id(node) not in undone:
+            text = f"{found.what} uses {ast.unparse(node)!r} ({found.place_in(node)}) outside of a 'with' statement"
+            raise Refused(f"{text}, so that later events may find it patched. Write: with {ast.unparse(node)}(...):")
+
+
 def _setter(what: str, name: str) -> Refused:
     text = f"{what} uses {name}, which sets something for the whole process, for later events and other threads too"
     return Refused(f"{text}. Do it in the notebook if no result depends on it, or leave it out.")
@@ -220,6 +233,7 @@ def check_reads(found: Definition, known: Patches) -> None:
     names = {**sys.modules, **found.names, **imported_by(found)}
     _check_reflection(found, names)
     _check_setters(found, names)
+    _check_mocks(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}

@@ -49,6 +49,10 @@ REFUSED = {
     "mask of new files": ("from os import umask as mask\ndef f(x):\n    return mask(0) if x > 100 else 0", r"'mask' \(cell \[2\], line 3\)"),
     "logging": ("def f(x):\n    import logging\n    if x > 100: logging.disable(50)\n    return x", r"'logging\.disable' \(cell \[2\], line 3\)"),
     "OpenCL": ("def f(x):\n    if x > 100: cv2.ocl.setUseOpenCL(False)\n    return cv2.ocl.useOpenCL()", r"'cv2\.ocl\.setUseOpenCL'"),
+    "mock that is left": (
+        "from unittest import mock\nimport math\ndef f(x):\n    if x > 100: mock.patch('math.floor').start()\n    return math.floor(x)",
+        r"'mock\.patch' \(cell \[2\], line 4\) outside of a 'with' statement",
+    ),
     "setter in a table": ("import os\nT = {'a': os.umask}\ndef f(x):\n    return T['a'](0) if x > 100 else 0", r"'posix\.umask', which sets something"),
 }  # fmt: skip
 
