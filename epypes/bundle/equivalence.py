@@ -364,7 +364,8 @@ def _words_of(parts: Iterable[ast.AST], function: types.FunctionType) -> set[str
     reads = [part for part in parts if isinstance(part, ast.Attribute) and part.attr in _NAMES]
     of_classes = {part.attr for part in reads if _is_class(part.value, names)}
     others = {part.attr for part in reads if not _is_class(part.value, names)} | texts
-    found = (_names(code) | texts) - (of_classes - others) | {_NAMES[name] for name in of_classes}
+    # The body of a class has two of these names, which it does not read.
+    found = (_names(code) - _NAMES.keys()) | others | {_NAMES[name] for name in of_classes}
     return found | {_TEXT_OF_CLASS for part in parts if any(_is_class(one, names) for one in _texts_made_of(part))}
 
 

@@ -111,7 +111,10 @@ _UNLOCKS: Final = frozenset(
     {"setflags", *(f"STORE_ATTR {name}" for name in ("writeable", "shape", "dtype", "strides", "data"))}
 )
 # Code with one of these notices that an array is locked, and may go on: its arrays are compared instead.
-_NOTICES_LOCKS: Final = frozenset({"except", "suppress", "__exit__", "exception", "flags"})
+_NOTICES_LOCKS: Final = frozenset(
+    {"except", "suppress", "__exit__", "exception", "flags", "__array_interface__", "__array_struct__", "ctypes"}
+    | {"Thread", "ThreadPoolExecutor", "submit"}
+)
 # Code with one of these may set something for the whole process until it is done: it never runs beside another call.
 _SETS_FOR_A_WHILE: Final = frozenset(
     {"chdir", "environ", "field_size_limit", "option_context", "patch", "rcParams", "rc_context", "redirect_stderr"}
