@@ -62,6 +62,7 @@ def takes_old_keywords(function: F) -> F:
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
         if kwargs and not _OLD.isdisjoint(kwargs):
             kwargs = _renamed(kwargs)
         return function(*args, **kwargs)

@@ -55,6 +55,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from epypes.deprecation import OldNames
+from epypes.tracebacks import render
 from epypes.wording import keep_as_state
 
 if TYPE_CHECKING:
@@ -69,6 +70,10 @@ class EpypesError(Exception):
     def __str__(self) -> str:
         # KeyError shows the repr of its argument; a sentence should be shown as it is.
         return str(self.args[0]) if self.args else type(self).__name__
+
+    def _render_traceback_(self) -> list[str]:
+        """Return the lines that IPython shows: they end at the user's own line."""
+        return render(self, is_own=True)
 
 
 class _PathError(EpypesError):
@@ -108,17 +113,24 @@ class GraphError(EpypesError, ValueError):
         super().__init__("\n".join(finding.text for finding in self.findings))
 
 
-class UnknownName(EpypesError, KeyError):
-    """A name that is not there, with the nearest one that is."""
+def nearest(name: object, known: Iterable[str]) -> str:
+    """Return the known name that is most like this one; empty if none is."""
+    return next(iter(difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.6)), "")
 
-    def __init__(self, kind: str, name: object, known: Iterable[str], where: str = "in this graph") -> None:
+
+class UnknownName(EpypesError, KeyError):
+    """A name that is not there, with the nearest one that is, or with other ``advice``."""
+
+    def __init__(
+        self, kind: str, name: object, known: Iterable[str], where: str = "in this graph", *, advice: str = ""
+    ) -> None:
         self.kind, self.name, self.known, self.where = kind, name, tuple(known), where
-        super().__init__(f"No {kind} {name!r} {where}.{self._hint()}")
+        super().__init__(f"No {kind} {name!r} {where}.{advice or self._hint()}")
 
     def _hint(self) -> str:
-        near = difflib.get_close_matches(str(self.name), self.known, n=1, cutoff=0.6)
+        near = nearest(self.name, self.known)
         if near:
-            return f" Did you mean {near[0]!r}?"
+            return f" Did you mean {near!r}?"
         if not self.known:
             return " There is none."
         some = ", ".join(self.known[:12])

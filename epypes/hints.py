@@ -128,6 +128,22 @@ class Param:
             return False
         return not self.odd or value % 2 == 1
 
+    def describe(self) -> str:
+        """Return the values in words.
+
+        Examples
+        --------
+        >>> Param(1, 31, odd=True).describe()
+        'an odd number from 1 to 31'
+        """
+        if self.choices is not None:
+            return f"one of {', '.join(map(repr, self.choices))}"
+        number = "an odd number" if self.odd else "a number"
+        if self.low is not None and self.high is not None:
+            return f"{number} from {self.low} to {self.high}"
+        ends = ((self.low, "or more"), (self.high, "or less"))
+        return ", ".join([number, *(f"{end} {side}" for end, side in ends if end is not None)])
+
 
 @dataclass(frozen=True, slots=True)
 class Roi:
@@ -149,6 +165,10 @@ class Roi:
     def allows(self, value: Any) -> bool:
         """Whether a value is a rectangle: a tuple or list of four integers, none of them negative."""
         return isinstance(value, tuple | list) and len(value) == 4 and all(map(_is_length, value))
+
+    def describe(self) -> str:
+        """Return the values in words."""
+        return "a rectangle (x, y, width, height) of four integers, none negative"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 import re
+from typing import Final
+
+# OpenCV begins its messages with its version and the place in its own source; what went wrong comes after.
+_OPENCV_PLACE: Final = re.compile(r"OpenCV\([^)\n]*\) [^\n]*?:-?\d+: error: ")
+# The name of a template, with all its parameters.
+_OPENCV_TEMPLATE: Final = re.compile(r" in function '[^']{60,}'")
+# In the link to the page of a service, its present and its former name.
+_ACCESS_KEY: Final = re.compile(r"([?&#](?:access_key|token)=)[^&#\s'\"]+")
 
 
 def counted(count: int, noun: str) -> str:
@@ -14,6 +22,27 @@ def ended(text: str) -> str:
     """Return a text with a full stop, unless it has an end of its own: what an exception says may be a sentence."""
     text = text.rstrip()
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def without_access_key(text: str) -> str:
+    """Return a text without the access key in the link to a service's page."""
+    return _ACCESS_KEY.sub(r"\1...", text)
+
+
+def error_message(error: BaseException) -> str:
+    """Return the text of any exception; of OpenCV's one line with what went wrong, without the place in its source."""
+    try:
+        # A plain string, whatever methods the one that is returned has.
+        text = str.__str__(str(error)).strip()
+    except BaseException:  # an exception's own __str__ may raise
+        return "(its message can't be had)"
+    place = _OPENCV_PLACE.match(text)
+    if place is None:
+        return text
+    lines = _OPENCV_TEMPLATE.sub("", text[place.end() :]).splitlines()
+    # One reason for each overload, which are often the same.
+    reasons = dict.fromkeys(line.strip("> ") for line in lines)
+    return " ".join(f"{line[2:]};" if line.startswith("- ") else line for line in reasons).rstrip(";")
 
 
 def keep_as_state(name: str, initial: str = "None", *, is_object: bool = False) -> str:

@@ -31,7 +31,7 @@ from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.nothing import Nothing
 from epypes.run import CompGraphRunner
-from epypes.wording import counted
+from epypes.wording import counted, error_message
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -399,7 +399,7 @@ def _differing(value: Any, expected: Any) -> str:
 
 def _failure(error: BaseException, check: Check) -> tuple[ErrorInfo, str]:
     """Return the error because of which nothing could be measured, and the reason that is shown."""
-    message = str(error).strip()
+    message = error_message(error)
     if isinstance(error, KeyError) and check.token is None:
         message = f"no token {message} is kept. If the graph has it, give the metric keep=[{message}]."
     error_info = ErrorInfo("", type(error).__name__, message)

@@ -22,6 +22,7 @@ from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Run
 from epypes.run.runner import branched
+from epypes.wording import error_message
 
 Setting = Mapping[str, Any]
 State = Mapping[str, Any]
@@ -209,7 +210,7 @@ def failed_outcome(item: Item, setting: Setting, error_info: ErrorInfo, total_ns
 
 def error_info_of(error: BaseException) -> ErrorInfo:
     """Return what failed where no function of the graph did."""
-    return ErrorInfo("", type(error).__name__, str(error))
+    return ErrorInfo("", type(error).__name__, error_message(error))
 
 
 def read_frames(job: Job, cg: CompGraph, *, of_cases: bool = False) -> Job:

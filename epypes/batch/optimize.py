@@ -36,7 +36,7 @@ from epypes.nothing import Nothing
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
-from epypes.wording import counted, ended
+from epypes.wording import counted, ended, error_message
 
 if TYPE_CHECKING:
     import optuna
@@ -520,7 +520,7 @@ class _Objective:
         try:
             given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
         except (Exception, SystemExit) as error:
-            raise _NotMeasured(f"{self.name} raised {type(error).__name__}: {error}") from error
+            raise _NotMeasured(f"{self.name} raised {type(error).__name__}: {error_message(error)}") from error
         if given is Nothing:
             raise _NotMeasured(f"{self.name} gave Nothing: nothing was found")
         try:

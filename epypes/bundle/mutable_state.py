@@ -807,7 +807,7 @@ class MutableState:
         attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
         @functools.wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
+        def call(*args: Any, __tracebackhide__: bool = True, **kwargs: Any) -> Any:
             # Another call of the bundle may have made this one in a thread of its own, which has no context.
             ticket = lock.acquire_read(only_if_free=id(node) in referred) if _held.get() is not lock else None
             if ticket is None:
@@ -856,7 +856,7 @@ def _attempt(
 ) -> tuple[Any, BaseException | None, str | None]:
     """Call a function; return its result, what it has raised, and what it has changed that outlives the call."""
     # What the call sets in the context is gone with that.
-    context, modules, error = copy_context(), len(sys.modules), None
+    __tracebackhide__, context, modules, error = True, copy_context(), len(sys.modules), None
     try:
         result = context.run(function, *args, **kwargs)
     except BaseException as raised:

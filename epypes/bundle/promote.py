@@ -44,6 +44,7 @@ from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import as_written
+from epypes.wording import error_message
 
 _LOG: Final = logging.getLogger("epypes.bundle")
 # From Linux's fcntl.h and fs.h.
@@ -234,7 +235,9 @@ def _run_from(
     try:
         return clone.run_on(payload)
     except Exception as error:  # whatever a function raises on it
-        raise Refused(f"{failure}: {type(error).__name__}: {error}{'.' * bool(way_out)}{way_out}") from error
+        raise Refused(
+            f"{failure}: {type(error).__name__}: {error_message(error)}{'.' * bool(way_out)}{way_out}"
+        ) from error
 
 
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:

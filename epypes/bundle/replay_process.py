@@ -49,6 +49,7 @@ from epypes.bundle.resolve import evaluated
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.run.guard import as_written
 from epypes.wire.samples import read_sample
+from epypes.wording import error_message
 
 REPLAY_TIMEOUT_S: Final = 600.0
 _MOST_NAMED: Final = 8
@@ -224,8 +225,8 @@ def _describe(error: BaseException, folder: Path) -> str:
         if frames
         else ""
     )
-    notes = "; ".join(getattr(error, "__notes__", ()))
-    text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(str(error).split())}"
+    notes = "; ".join(" ".join(note.split()) for note in getattr(error, "__notes__", ()))
+    text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(error_message(error).split())}"
     if isinstance(error, ModuleNotFoundError):
         text += f". {MODULES_OF_A_BUNDLE}"
     elif isinstance(error, FileNotFoundError) and not os.path.isabs(os.fsdecode(error.filename or os.sep)):

@@ -9,6 +9,9 @@ Nothing here imports these libraries: a caller that uses their functions has imp
 
 from epypes.catalog.calls import parameter_names, uses
 from epypes.catalog.lookup import CatalogEntry, entry_of, fits, table, usual
-from epypes.catalog.ranges import plain, range_of
+from epypes.catalog.ranges import plain, range_of, reason_against
 
-__all__ = ["CatalogEntry", "entry_of", "fits", "parameter_names", "plain", "range_of", "table", "uses", "usual"]
+__all__ = [
+    "CatalogEntry", "entry_of", "fits", "parameter_names", "plain", "range_of", "reason_against", "table", "uses",
+    "usual",
+]  # fmt: skip

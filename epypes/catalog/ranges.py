@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from epypes.catalog.calls import parameter_names, uses
-from epypes.catalog.lookup import entry_of, fits, usual
+from epypes.catalog.lookup import CatalogEntry, entry_of, fits, usual
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi
 
@@ -38,6 +38,22 @@ def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:
     return None
 
 
+def reason_against(cg: CompGraph, function: str, token: str, value: Any) -> str:
+    """Return why a function can't take this number for an input token, as a clause; empty if nothing says so.
+
+    Annotations are asked, then the library functions that get the value: what is only usual there forbids nothing.
+    """
+    number = plain(value)
+    for hint in annotated_params(cg, token):
+        if isinstance(hint, Roi) or not hint.allows(number):
+            return f"its annotation allows {hint.describe()}"
+    for entry in _entries(cg, function, token)[1]:
+        # Constants are listed as far as they are usual.
+        if not entry.constants and not fits(entry.param, number):
+            return f"{entry.library}.{entry.function} takes {entry.param.describe()}"
+    return ""
+
+
 def _hints(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
     """Give what annotations and switches say."""
     yield from annotated_params(cg, token)
@@ -51,13 +67,19 @@ def _usual(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
     """Give what is usual for the functions that get a value, then what is usual for its names."""
     names: dict[str, None] = {}
     for name in cg.digraph.consumers.get(token, ()):
-        function, position = cg.functions[name], cg.func_inputs(name).index(token)
-        parameter = dict(enumerate(parameter_names(function))).get(position, "")
+        parameter, entries = _entries(cg, name, token)
         names[parameter] = None
-        entries = [entry_of(function, parameter), *(use.entry for use in uses(function, parameter))]
-        yield from filter(None, (entry.resolved() for entry in entries if entry))
+        yield from filter(None, (entry.resolved() for entry in entries))
     if isinstance(value, int | float | str):
         yield from filter(None, (usual(name, value) for name in (*names, token) if name))
+
+
+def _entries(cg: CompGraph, name: str, token: str) -> tuple[str, list[CatalogEntry]]:
+    """Return the parameter by which a function of a graph takes a token, and what the table knows of it."""
+    function, position = cg.functions[name], cg.func_inputs(name).index(token)
+    parameter = dict(enumerate(parameter_names(function))).get(position, "")
+    found = [entry_of(function, parameter), *(use.entry for use in uses(function, parameter))]
+    return parameter, [entry for entry in found if entry]
 
 
 def without_negative(hint: Param, value: Any) -> Param:

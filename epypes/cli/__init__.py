@@ -19,6 +19,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     from epypes.cli.app import app
     from epypes.errors import EpypesError
+    from epypes.wording import without_access_key
 
     try:
         status = app.main(arguments, prog_name="epypes", standalone_mode=False)
@@ -40,4 +41,5 @@ def main(arguments: list[str] | None = None) -> None:
         if missing is None:
             raise
         status = f"epypes: {missing}"
-    sys.exit(status)
+    # The user may have given a service by the link to its page.
+    sys.exit(without_access_key(status) if isinstance(status, str) else status)

@@ -13,17 +13,28 @@ from epypes.cli.experiment import experiment
 from epypes.cli.failures import failures, replay
 from epypes.cli.lab import lab
 from epypes.cli.machine import doctor, export, keys
+from epypes.cli.options import Group
 from epypes.cli.recordings import play, record
 from epypes.cli.services import deploy, reset, rollback, serve, set_parameters, stop
 from epypes.cli.status import status
 
-_COMMANDS = (
-    *(promote, verify, check, serve, call, status, set_parameters, reset, stop, deploy, rollback, failures, replay),
-    *(record, play, keys, doctor, export, lab, demo, experiment),
-)
-app = click.Group(
+_TOPICS = {
+    "From a notebook to a bundle": (promote, verify, check, demo),
+    "A running service": (serve, call, status, set_parameters, reset, deploy, rollback, stop),
+    "Events that failed": (failures, replay),
+    "Recordings of messages": (record, play),
+    "This machine": (lab, doctor, keys, export),
+    "The paper": (experiment,),
+}
+app = Group(
     "epypes",
-    commands=_COMMANDS,
+    commands=[each for commands in _TOPICS.values() for each in commands],
+    topics={title: [str(each.name) for each in commands] for title, commands in _TOPICS.items()},
     help="Vision algorithms as computational graphs: promoted from a notebook, verified, served and called.",
-    context_settings={"show_default": True},
+    examples=(
+        "epypes promote 01_edge_detection.ipynb --output edges --to services/edges",
+        "epypes serve services/edges --http 127.0.0.1:8642",
+        "epypes serve -h",
+    ),
 )
+click.version_option(package_name="epypes", message="%(prog)s %(version)s")(app)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from epypes.cli.options import PATH, bundle_argument, json_option
+from epypes.cli.options import PATH, bundle_argument, command, json_option
 from epypes.cli.terminal import json_of, print_table
 from epypes.errors import BundleError, ReplayDiffers, ScaleError
 from epypes.wording import counted, ended
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from epypes.bundle.replay import ReplayReport
 
 
-@click.command()
+@command("epypes promote 01_edge_detection.ipynb --name runner --output edges --to services/edges")
 @click.argument("notebook", type=PATH, help="Notebook; it is executed in a new kernel and not changed.")
 @click.option("--to", type=PATH, required=True, help="Folder of the bundle; an existing bundle is replaced.")
 @click.option("--name", default="runner", help="Variable that holds the runner or pipeline.")
@@ -58,7 +58,7 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], s
         click.echo(f"Note: {assumptions}", err=True)
 
 
-@click.command()
+@command("epypes verify services/edges", "epypes verify services/edges --fresh-env")
 @bundle_argument
 @click.option("--fresh-env", is_flag=True, help="Replay in a new environment, made from requirements.txt alone.")
 @click.option(
@@ -102,7 +102,7 @@ def _describe_difference(bundle: Path, report: ReplayReport) -> str:
     return f"{bundle} does not compute what was recorded: {found}.{cause}"
 
 
-@click.command()
+@command("epypes check services/edges cases.toml --junit report.xml")
 @bundle_argument
 @click.argument("cases", type=PATH, metavar="CASES.toml", help="File of the cases.")
 @click.option("--junit", type=PATH, help="File for JUnit XML, for continuous integration.")

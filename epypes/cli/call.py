@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from epypes.cli.bundles import run_promotion
-from epypes.cli.options import PATH, allow_option, bundle_argument, keys_option, seconds_option
+from epypes.cli.options import PATH, allow_option, bundle_argument, command, keys_option, seconds_option
 from epypes.cli.terminal import json_of, print_table
 from epypes.errors import ServiceError, UnknownName
 
@@ -38,7 +38,10 @@ _address_option: Final = functools.partial(
 )
 
 
-@click.command()
+@command(
+    "epypes call services/edges photo.png --out edges.png",
+    "epypes call services/stereo left=l.png right=r.png --out disparity=d.npy",
+)
 @bundle_argument
 @click.argument(
     "images", nargs=-1, required=True, help="Image file or number; or TOKEN=FILE, TOKEN=NUMBER for each input token."
@@ -200,7 +203,7 @@ def _write(file: str, value: Any, order: Order) -> None:
         raise ServiceError(file, f"The answer is of type {kind}, not an image. Leave out --out to print it.")
 
 
-@click.command()
+@command("epypes demo 01_edge_detection.ipynb --output edges")
 @click.argument("notebook", type=PATH, help="Notebook with a runner.")
 @click.option("--to", type=PATH, default="demo-output", help="Folder for the results.")
 @click.option("--name", default="runner", help="Variable that holds the runner.")

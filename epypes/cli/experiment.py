@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from epypes.cli.options import PATH, seconds_option
+from epypes.cli.options import PATH, command, seconds_option
 
 if TYPE_CHECKING:
     from epypes.experiment import Results
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _MAX_DRAWINGS: Final = 200
 
 
-@click.command()
+@command("epypes experiment --layout one --requests 100 --experiments 2 --out figures")
 @click.option("--layout", default="paper", help="How the nodes are spread over processes: paper, one or three.")
 @click.option("--requests", default=500, help="Number of requests in each experiment, one after another.")
 @click.option("--experiments", default=5, help="Number of experiments; each starts all processes anew.")

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from epypes.cli.options import PATH, allow_option, any_source_argument, keys_option, seconds_option
+from epypes.cli.options import PATH, allow_option, any_source_argument, command, keys_option, seconds_option
 from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError
+from epypes.wording import without_access_key
 
 if TYPE_CHECKING:
     from epypes.service.failures.record import FailedEvent
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 _MAX_CHARACTERS: Final = 200
 
 
-@click.command()
+@command("epypes failures services/edges", "epypes failures services/edges --follow")
 @any_source_argument
 @click.option("--limit", type=click.IntRange(1), default=20, help="Number of failures, newest first.")
 @click.option("--json", "as_json", is_flag=True, help="Print each failure as a line of JSON.")
@@ -51,7 +52,7 @@ def failures(
         click.echo(f"To run it again in a separate process: epypes replay {found[0].id}")
         click.echo(f"In a notebook: ep.load_failure({found[0].id!r})")
     else:
-        click.echo(f"No failures of {source} are stored." if source else "No failures are stored.")
+        click.echo(f"No failures of {without_access_key(source)} are stored." if source else "No failures are stored.")
 
 
 def _follow(source: str | None, as_json: bool, keys: Path | None, allow: Sequence[Path] | None) -> None:
@@ -62,7 +63,7 @@ def _follow(source: str | None, as_json: bool, keys: Path | None, allow: Sequenc
     try:
         for record in follow_failures(source, keys=keys, allow=allow):
             if record is None:
-                click.echo(f"Listening for failures of {source}. Ctrl+C ends it.", err=True)
+                click.echo(f"Listening for failures of {without_access_key(source)}. Ctrl+C ends it.", err=True)
             elif as_json:
                 click.echo(json.dumps(asdict(record)))
             else:
@@ -103,7 +104,7 @@ def _print_failures(records: Sequence[FailedEvent]) -> None:
     print_table(columns, rows)
 
 
-@click.command()
+@command("epypes replay latest services/edges --trace")
 @click.argument("failure", metavar="ID", help="Id of the failure, its beginning or end, its event's id, or latest.")
 @any_source_argument
 @click.option("--bundle", type=PATH, help="Folder of the bundle, if it was served from another path.")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from epypes.cli.options import command
 from epypes.errors import ServiceError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ _ADDRESS: Final = ("--ip", "--ServerApp.ip")
 _CONNECTION_CLASS: Final = "kernel_websocket_connection_class"
 
 
-@click.command()
+@command("epypes lab notebooks", "epypes lab -- --port 8899 --no-browser")
 @click.argument("arguments", nargs=-1, metavar="[FOLDER] [-- OPTIONS]", help="Folder to open; options of JupyterLab.")
 def lab(arguments: tuple[str, ...]) -> None:
     """Start JupyterLab on this machine.

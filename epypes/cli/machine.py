@@ -13,7 +13,7 @@ from typing import Final
 
 import click
 
-from epypes.cli.options import PATH, bundle_argument, json_option
+from epypes.cli.options import PATH, Group, bundle_argument, command, json_option
 from epypes.cli.terminal import print_table
 from epypes.errors import KeysError, ServiceError
 
@@ -23,7 +23,7 @@ _COLOURS: Final = {"ok": "green", "warning": "yellow", "failed": "red"}
 _serve_options: Final = click.argument("options", nargs=-1, metavar="-- OPTIONS", help="Options of epypes serve.")
 
 
-@click.command()
+@command("epypes keys camera --to keys", "epypes keys --list")
 @click.argument("name", default="", help="Name of the pair, as camera or robot; optional with --list.")
 @click.option("--to", "folder", type=PATH, help="Folder of the keys; default: ~/.config/epypes/keys.")
 @click.option("--list", "listed", is_flag=True, help="Print the public keys in the folder; make none.")
@@ -72,7 +72,7 @@ def _secret_state(file: Path) -> str:
     return "here" if file.stat().st_mode & 0o077 == 0 else f"others can read it: chmod 600 {file}"
 
 
-@click.command()
+@command("epypes doctor services/edges --address tcp://127.0.0.1:5555")
 @click.argument("bundle", type=PATH, required=False, help="Bundle to serve, or being served.")
 @click.option("--address", multiple=True, help="Address to bind, or of a broker; may be repeated.")
 @click.option("--keys", type=PATH, multiple=True, help="File of keys to be used; may be repeated.")
@@ -100,7 +100,7 @@ def doctor(bundle: Path | None, address: Sequence[str], keys: Sequence[Path], as
         raise ServiceError(bundle or "this machine", text)
 
 
-@click.group()
+@click.group(cls=Group, examples=["epypes export systemd services/edges -- --http 127.0.0.1:8642"])
 def export() -> None:
     """Write a systemd unit or a container file for a bundle.
 
@@ -108,7 +108,7 @@ def export() -> None:
     """
 
 
-@export.command()
+@export.command(examples=["epypes export systemd services/edges --to /etc/systemd/system -- --http 127.0.0.1:8642"])
 @bundle_argument
 @_serve_options
 @click.option("--to", type=PATH, help="File, or folder for it; default: standard output.")
@@ -130,7 +130,9 @@ def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) ->
     click.echo(f"Wrote {file}. What to do with it stands at its top.")
 
 
-@export.command()
+@export.command(
+    examples=["epypes export docker services/edges --to edges-image -- --sub 'tcp://0.0.0.0:5555' --insecure"]
+)
 @bundle_argument
 @_serve_options
 @click.option("--to", type=PATH, required=True, help="Folder to write; it must not exist yet.")

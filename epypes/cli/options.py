@@ -1,17 +1,87 @@
-"""Arguments and options that several commands share."""
+"""What the commands share: how their help is laid out, arguments and options."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import click
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+Callback = TypeVar("Callback", bound=Callable[..., Any])
 
 PATH: Final = click.Path(path_type=Path)
+# Options that had another name once: both are taken.
+_RENAMED: Final[Mapping[str, str]] = {"token-file": "access-key-file"}
+_SETTINGS: Final[dict[str, Any]] = {
+    "show_default": True,
+    "help_option_names": ["-h", "--help"],
+    "token_normalize_func": lambda name: _RENAMED.get(name, name),
+}
+
+
+class _Command(click.Command):
+    """A command whose help ends with examples."""
+
+    def __init__(self, *args: Any, examples: Sequence[str] = (), **options: Any) -> None:
+        options["context_settings"] = _SETTINGS
+        super().__init__(*args, **options)
+        self.examples = tuple(examples)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples, each in a line that can be pasted."""
+        _write_examples(formatter, self.examples)
+
+
+class Group(click.Group):
+    """Commands by topic.
+
+    Parameters
+    ----------
+    topics
+        The names of the commands by the title of their topic; without, all stand under one title.
+    examples
+        Lines that can be pasted.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        topics: Mapping[str, Sequence[str]] | None = None,
+        examples: Sequence[str] = (),
+        **options: Any,
+    ) -> None:
+        super().__init__(*args, context_settings=_SETTINGS, **options)
+        self.topics = topics or {"Commands": ()}
+        self.examples = tuple(examples)
+        self.command_class = _Command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands of each topic with their first sentence, all in the same columns."""
+        width = max(map(len, self.commands))
+        for title, names in self.topics.items():
+            rows = [(name.ljust(width), self.commands[name].get_short_help_str(80)) for name in names or self.commands]
+            with formatter.section(title):
+                formatter.write_dl(rows)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples, each in a line that can be pasted."""
+        _write_examples(formatter, self.examples)
+
+
+def _write_examples(formatter: click.HelpFormatter, examples: Sequence[str]) -> None:
+    if examples:
+        with formatter.section("Examples" if len(examples) > 1 else "Example"):
+            for line in examples:
+                # Never wrapped: a line is pasted as it is.
+                formatter.write(f"{'':{formatter.current_indent}}{line}\n")
+
+
+def command(*examples: str, name: str | None = None) -> Callable[[Callable[..., Any]], click.Command]:
+    """Return the decorator that makes a function a command, with examples of its use."""
+    return click.command(name, cls=_Command, examples=examples)
+
 
 bundle_argument: Final = click.argument("bundle", type=PATH, help="Folder of the bundle.")
 source_argument: Final = click.argument("source", help="Folder of the served bundle, or http URL of the service.")
@@ -29,7 +99,7 @@ def refuse_nan(context: click.Context, option: click.Parameter, value: float | N
     return value
 
 
-def seconds_option(name: str, default: float, text: str, least: float = 0.0) -> Callable[[Command], Command]:
+def seconds_option(name: str, default: float, text: str, least: float = 0.0) -> Callable[[Callback], Callback]:
     """Return an option for a duration in seconds, whose parameter ends in ``_s``."""
     parameter = f"{name.removeprefix('--').replace('-', '_')}_s"
     range_ = click.FloatRange(least)
@@ -41,10 +111,10 @@ json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print
 replica_option: Final = click.option(
     "--replica", default="", show_default=False, help="Name of one replica, if several of the bundle run here."
 )
-token_file_option: Final = click.option(
-    "--token-file",
+access_key_option: Final = click.option(
+    "--access-key-file",
     type=PATH,
-    help="File with the service's access token; default: EPYPES_TOKEN, or that of a service here.",
+    help="File with the service's access key; default: EPYPES_ACCESS_KEY, or that of a service here.",
 )
 insecure_option: Final = click.option("--insecure", is_flag=True, help="Bind addresses that other machines can reach.")
 keys_option: Final = click.option("--keys", type=PATH, help="The .key_secret file of this side; epypes keys makes it.")

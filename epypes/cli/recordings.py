@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import click
 
-from epypes.cli.options import PATH, allow_option, insecure_option, keys_option, refuse_nan
+from epypes.cli.options import PATH, allow_option, command, insecure_option, keys_option, refuse_nan
 from epypes.errors import RecordingError
 from epypes.wording import counted
 
@@ -22,7 +22,7 @@ _STOP_S: Final = 30.0
 _SPEED: Final = click.FloatRange(0.0)
 
 
-@click.command()
+@command("epypes record tcp://127.0.0.1:5556 answers.mcap --seconds 60")
 @click.argument("address", help="Address of the publisher; bind:ADDRESS binds.")
 @click.argument("file", type=PATH, help="MCAP file to write.")
 @click.option("--topic", default="", show_default=False, help="Record only this topic and those below it.")
@@ -55,7 +55,7 @@ def record(
         signals.wait(seconds)
 
 
-@click.command()
+@command("epypes play answers.mcap tcp://127.0.0.1:5555 --speed 2")
 @click.argument("file", type=PATH, help="MCAP file that epypes record wrote.")
 @click.argument(
     "address", default="tcp://127.0.0.1:*", help="Address to bind (default: any port); connect:ADDRESS connects."

@@ -9,6 +9,7 @@ import os
 import resource
 import select
 import signal
+import stat
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -21,16 +22,18 @@ import click
 
 from epypes.cli.options import (
     PATH,
+    access_key_option,
     allow_option,
     bundle_argument,
+    command,
     insecure_option,
     keys_option,
     replica_option,
     seconds_option,
     source_argument,
-    token_file_option,
 )
 from epypes.errors import KeysError, ServiceError
+from epypes.wording import without_access_key
 
 if TYPE_CHECKING:
     from epypes.service.event_states import StateChoice
@@ -72,10 +75,11 @@ def states_of(source: str, replica: str = "") -> list[ServiceState]:
     ServiceError
         No service runs for this bundle, or at this address.
     """
+    from epypes.service.remote.control import split_url
     from epypes.service.state_file import read_states, running_at
 
     if is_url(source):
-        found = [state for state in [running_at(source)] if state is not None]
+        found = [state for state in [running_at(split_url(source)[0])] if state is not None]
         way_out = "Is it another user's, or another machine's?"
     else:
         if not Path(source).is_dir():
@@ -87,7 +91,7 @@ def states_of(source: str, replica: str = "") -> list[ServiceState]:
     return found
 
 
-def connect_to(source: str, token_file: Path | None, replica: str = "") -> Connection:
+def connect_to(source: str, access_key_file: Path | None, replica: str = "") -> Connection:
     """Connect to the HTTP control of a service; of several replicas to the first that has one.
 
     Raises
@@ -95,7 +99,7 @@ def connect_to(source: str, token_file: Path | None, replica: str = "") -> Conne
     ServiceError
         No service runs, or it has no HTTP address.
     KeysError
-        The token can't be read.
+        The access key can't be read.
     """
     from epypes.service.remote.connection import connect
 
@@ -103,10 +107,11 @@ def connect_to(source: str, token_file: Path | None, replica: str = "") -> Conne
     if not url:
         raise ServiceError(source, f"The service of {source} has no HTTP address. Start it with --http 127.0.0.1:8642.")
     try:
-        token = None if token_file is None else token_file.read_text(encoding="ascii").strip()
+        key = None if access_key_file is None else access_key_file.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise KeysError(token_file, f"The token file {token_file} can't be read: {error}.") from error
-    return connect(url, token=token)
+        text = f"The file {access_key_file} of the access key can't be read: {error}."
+        raise KeysError(access_key_file, text) from error
+    return connect(url, access_key=key)
 
 
 def describe_bundle(service: Mapping[str, Any]) -> str:
@@ -122,7 +127,11 @@ def describe_failures(address: str, is_shown: bool) -> str:
 # -- the commands -----------------------------------------------------------------------------------------------------
 
 
-@click.command()
+@command(
+    "epypes serve services/edges --http 127.0.0.1:8642",
+    "epypes serve services/edges --sub tcp://127.0.0.1:5555 --pub tcp://127.0.0.1:5556 --threads 2",
+    "epypes serve services/edges --sub 'amqp://127.0.0.1/frames?create=true' --pub amqp://127.0.0.1/edges",
+)
 @bundle_argument
 @click.option("--sub", default=_ANY_PORT, help="Address of events: one to bind, connect:ADDRESS, or a broker's queue.")
 @click.option("--pub", default=_ANY_PORT, help="Address of answers: one to bind, connect:ADDRESS, or a broker's queue.")
@@ -142,7 +151,7 @@ def describe_failures(address: str, is_shown: bool) -> str:
 @insecure_option
 @keys_option
 @allow_option
-@click.option("--token-file", type=PATH, help="File with the token of the HTTP control; default: a new one.")
+@click.option("--access-key-file", type=PATH, help="File of the HTTP control's access key; default: a new one.")
 @click.option("--store", help="SQLite file (extra store) or database URL (extra postgres), for a row per event.")
 @click.option("--replica", default="", show_default="a number", help="Name among the replicas that share a queue.")
 @click.option(
@@ -201,13 +210,18 @@ def _print_ready(bundle: Path, state: ServiceState) -> None:
     addresses = f"events at {state.sub}, answers at {state.pub}{failures}{http}"
     click.echo(f"READY {bundle}{named}: {addresses}, process {state.pid}.")
     if state.http:
-        # The token is for the terminal alone: other users may read a log.
-        token = Path(state.token_file).read_text(encoding="utf-8").strip() if sys.stdout.isatty() else ""
-        page = f"{state.http}/{f'#token={token}' if token else ''}"
-        click.echo(f"Live page: {page} (the access token, for changes, is in {state.token_file})")
+        key = "" if _is_log(sys.stdout) else Path(state.access_key_file).read_text(encoding="utf-8").strip()
+        click.echo(f"Live page: {state.http}/{f'?access_key={key}' if key else ''}")
+        click.echo(f"Its access key, which allows changes, is in {state.access_key_file}")
 
 
-@click.command()
+def _is_log(stream: TextIO) -> bool:
+    """Whether others may read later what is written: in a file, or in systemd's journal, which is a socket."""
+    mode = os.fstat(stream.fileno()).st_mode
+    return stat.S_ISREG(mode) or stat.S_ISSOCK(mode)
+
+
+@command("epypes stop services/edges")
 @source_argument
 @seconds_option("--timeout", 30.0, "Longest wait for its end")
 @replica_option
@@ -224,7 +238,7 @@ def stop(source: str, timeout_s: float, replica: str) -> None:
         for state, process in [(state, _terminate(state, opened)) for state in states]:
             if process is None or select.select([process], [], [], max(end_s - monotonic(), 0.0))[0]:
                 named = f", replica {state.replica}" if state.replica else ""
-                click.echo(f"STOPPED {source}{named}, process {state.pid}.")
+                click.echo(f"STOPPED {without_access_key(source)}{named}, process {state.pid}.")
             else:
                 late.append(f"Process {state.pid}, which serves {source},")
     if late:
@@ -245,19 +259,19 @@ def _terminate(state: ServiceState, opened: ExitStack) -> int | None:
     return process
 
 
-@click.command("set")
+@command("epypes set services/edges canny_lo=90 blur_kernel=5", name="set")
 @source_argument
 @click.argument("values", nargs=-1, required=True, help="NAME=VALUE, as sigma=1.4 or method=sobel.")
-@token_file_option
+@access_key_option
 @replica_option
-def set_parameters(source: str, values: Sequence[str], token_file: Path | None, replica: str) -> None:
+def set_parameters(source: str, values: Sequence[str], access_key_file: Path | None, replica: str) -> None:
     """Set hyperparameters of a running service.
 
     All values change together, between two events. Replicas that share a queue take them over. epypes deploy resets
     them.
     """
     wanted = dict(_parse_assignment(text) for text in values)
-    with connect_to(source, token_file, replica) as service:
+    with connect_to(source, access_key_file, replica) as service:
         before = service.parameters().entries
         now = service.set(**wanted)
     old, new = ({name: json.dumps(entries[name].get("value")) for name in wanted} for entries in (before, now.entries))
@@ -276,12 +290,12 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
         return name, value
 
 
-@click.command()
+@command("epypes reset services/lane --source left")
 @source_argument
 @click.option("--source", "event_source", help="Source of events whose state alone is reset.", show_default="all")
-@token_file_option
+@access_key_option
 @replica_option
-def reset(source: str, event_source: str | None, token_file: Path | None, replica: str) -> None:
+def reset(source: str, event_source: str | None, access_key_file: Path | None, replica: str) -> None:
     """Reset the state between events of a running service.
 
     The next event begins with the initial values of the delays, as the first one did. Stopping a service resets its
@@ -292,7 +306,7 @@ def reset(source: str, event_source: str | None, token_file: Path | None, replic
     refusals = []
     for url in urls or [source]:
         try:
-            with connect_to(url, token_file, replica) as service:
+            with connect_to(url, access_key_file, replica) as service:
                 service.reset(event_source)
         except ServiceError as error:
             refusals.append(error)
@@ -304,32 +318,32 @@ def reset(source: str, event_source: str | None, token_file: Path | None, replic
     click.echo(f"RESET the state between events{of}.")
 
 
-@click.command()
+@command("epypes deploy services/edges_2 --http http://127.0.0.1:8642")
 @click.argument("bundle", type=PATH, help="Folder of the bundle, on the service's machine.")
 @_service_option
 @_state_option
-@token_file_option
-def deploy(bundle: Path, source: str, state: StateChoice | None, token_file: Path | None) -> None:
+@access_key_option
+def deploy(bundle: Path, source: str, state: StateChoice | None, access_key_file: Path | None) -> None:
     """Deploy another bundle to a running service.
 
     The service replays the bundle first; if it computes something else, the service keeps the old one.
     """
-    with connect_to(source, token_file) as connection:
+    with connect_to(source, access_key_file) as connection:
         before = connection.info()
         click.echo(f"{bundle} is replayed beside {before['bundle']}, which goes on meanwhile.", err=True)
         _print_exchange("DEPLOYED", before, connection.deploy(bundle, state))
 
 
-@click.command()
+@command("epypes rollback --http http://127.0.0.1:8642")
 @_service_option
 @_state_option
-@token_file_option
-def rollback(source: str, state: StateChoice | None, token_file: Path | None) -> None:
+@access_key_option
+def rollback(source: str, state: StateChoice | None, access_key_file: Path | None) -> None:
     """Return a running service to its previous bundle.
 
     A second rollback returns to the bundle before the first.
     """
-    with connect_to(source, token_file) as connection:
+    with connect_to(source, access_key_file) as connection:
         _print_exchange("ROLLED BACK", connection.info(), connection.rollback(state))
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from epypes.cli.options import json_option, replica_option, source_argument
+from epypes.cli.options import command, json_option, replica_option, source_argument
 from epypes.cli.services import DIGITS, connect_to, describe_bundle, describe_failures, is_url, states_of
 from epypes.errors import EpypesError
 from epypes.wording import counted
@@ -30,7 +30,7 @@ _NO_HTTP: Final = "no --http"
 Info = dict[str, Any]
 
 
-@click.command()
+@command("epypes status services/edges", "epypes status http://127.0.0.1:8642 --json")
 @source_argument
 @json_option
 @replica_option

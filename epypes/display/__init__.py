@@ -6,6 +6,7 @@ from epypes.display.previews.drawing import scene_picture
 from epypes.display.previews.encoding import encode_image
 from epypes.display.previews.images import is_image
 from epypes.display.previews.preview import register_preview
+from epypes.display.views.full_pictures import full_picture
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.surroundings import reset_display_ranges, scene_of
 from epypes.display.views.view import view
@@ -24,6 +25,7 @@ __all__ = [
     "Preview",
     "Scene",
     "encode_image",
+    "full_picture",
     "is_image",
     "mimebundle",
     "register_preview",

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from epypes.display.layout import Direction
-from epypes.display.paint.page import paint_figure, paint_graph, paint_page
+from epypes.display.paint.page import paint_figure, paint_graph, paint_kept, paint_page
 from epypes.display.paint.paper import save_on_paper
 from epypes.display.paint.svg import alt_text, paint_svg
 from epypes.display.paint.tables import Tabular, paint_table, paint_text, repr_text, summary_of, table_of, text_table
 from epypes.display.paint.times import paint_bars, times_alt_text, times_of
 from epypes.display.previews.short import reason
 from epypes.display.text import MOST_THUMBNAILS, escape, size
+from epypes.display.views.full_pictures import address_of, kept_pictures, run_of
 from epypes.display.views.graphview import GraphView, to_json
 from epypes.display.views.groups import function_count
 from epypes.display.views.view import view
 from epypes.errors import LayoutUnavailable
-from epypes.run import Plan, RunReport, TimingSummary
+from epypes.run import Plan, Run, RunReport, TimingSummary
 from epypes.run.timing import Reports
 from epypes.wording import counted
 
@@ -63,22 +64,23 @@ def to_text(shown: Tabular) -> str:
 
 def _forms(shown: Any) -> Forms:
     if isinstance(shown, Figure):
-        return _graph_forms(shown.view, shown.table)
+        return _graph_forms(shown.view, shown.table, shown.run)
     if isinstance(shown, Reports):
         shown = summary_of(shown)
     if isinstance(shown, str):
         return {"text/html": f"<p>{shown}</p>"}
     if not isinstance(shown, RunReport | TimingSummary):
-        return _graph_forms(view(shown), _table_below(shown))
+        return _graph_forms(view(shown), _table_below(shown), run_of(shown))
     times = times_of(shown)
     svg = paint_bars(times)
     figure = paint_figure(svg, times_alt_text(times), times.legend)
     return {"text/html": paint_page(figure, paint_table(table_of(shown))), "image/svg+xml": svg}
 
 
-def _graph_forms(graph: GraphView, below: str) -> Forms:
-    svg = paint_svg(graph)
-    return {"text/html": paint_page(*paint_graph(graph, svg, size(below)), below), "image/svg+xml": svg}
+def _graph_forms(graph: GraphView, below: str, run: Run | None) -> Forms:
+    svg, kept = paint_svg(graph), paint_kept(kept_pictures(graph, run)) if run is not None else ""
+    html = paint_page(*paint_graph(graph, svg, size(below)), kept, below, address=address_of(run))
+    return {"text/html": html, "image/svg+xml": svg}
 
 
 def _table_below(shown: Any) -> str:
@@ -96,10 +98,13 @@ class Figure:
         What is to be seen of it.
     table
         HTML that stands below the picture.
+    run
+        The run whose values are seen, if there is one; in a notebook its tokens' pictures are seen in full.
     """
 
     view: GraphView
     table: str = ""
+    run: Run | None = field(default=None, repr=False, compare=False)
 
     @property
     def svg(self) -> str:
@@ -109,7 +114,7 @@ class Figure:
     @property
     def html(self) -> str:
         """The picture for a page, with its caption and the insides of its groups."""
-        return _graph_forms(self.view, self.table)["text/html"]
+        return _graph_forms(self.view, self.table, self.run)["text/html"]
 
     def save(self, path: str | Path) -> Path:
         """Write the picture as ``.svg``, ``.pdf`` or ``.png``, as a page as ``.html``, or what is seen as ``.json``.
@@ -170,7 +175,8 @@ def show(
         The groups whose functions are drawn one by one.
     collapse
         Whether groups are drawn as one box each, but for those that are open. Beside those of ``ep.group``, functions
-        whose names have one prefix (``left.blur``, ``left.canny`` ...) are a group in a graph of more than 24.
+        whose names have one prefix (``left.blur``, ``left.canny`` ...) are a group in a graph of more than 24; if it
+        has still more than 24 boxes, so are stretches of the way that the data takes (``"blur … canny"``).
 
     Returns
     -------
@@ -191,4 +197,4 @@ def show(
     <Figure: 1 function; right>
     """
     graph = view(shown, direction=direction, thumbnails=thumbnails, open=open, collapse=collapse)
-    return Figure(graph, _table_below(shown))
+    return Figure(graph, _table_below(shown), run_of(shown))

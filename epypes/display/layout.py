@@ -66,6 +66,8 @@ class Layout:
         return Layout(width, height, tuple(map(move, self.centres)), splines)
 
 
+# What JupyterLab has for an output, in a window of 1440 pixels with its file browser open.
+_PAGE_PX: Final = 1_000.0
 # Graphviz takes 0.25 s for so many vertices and 0.9 s for twice as many, and beyond them pygraphviz prints a warning.
 _MOST_VERTICES: Final = 1000
 
@@ -98,13 +100,17 @@ def lay_out(
         No engine answered.
     """
     if direction == "down":
-        return _downwards(boxes, edges, back, is_dense)
+        layout = _downwards(boxes, edges, back, is_dense)
+        narrow = _downwards(boxes, edges, back, is_dense, is_narrow=True) if layout.width > _PAGE_PX else layout
+        return narrow if narrow.width < layout.width else layout
     layout = _downwards(tuple(Box(box.shape, box.height, box.width) for box in boxes), edges, back, is_dense)
     return layout.moved(lambda point: point[::-1], layout.height, layout.width)
 
 
-def _downwards(boxes: tuple[Box, ...], edges: tuple[Edge, ...], back: tuple[Edge, ...], is_dense: bool) -> Layout:
-    graph = fold(boxes, edges, {end for edge in back for end in edge})
+def _downwards(
+    boxes: tuple[Box, ...], edges: tuple[Edge, ...], back: tuple[Edge, ...], is_dense: bool, *, is_narrow: bool = False
+) -> Layout:
+    graph = fold(boxes, edges, {end for edge in back for end in edge}, is_narrow=is_narrow)
     if is_dense or len(graph.boxes) > _MOST_VERTICES:
         return _in_rows(boxes, edges)
     small_back = [graph.folded(edge) for edge in back]
@@ -123,6 +129,9 @@ def _downwards(boxes: tuple[Box, ...], edges: tuple[Edge, ...], back: tuple[Edge
 
 _POINTS_PER_INCH: Final = 72.0
 _DOT_TIMEOUT_S: Final = 30.0
+# How much straighter than a hyperparameter's edges those of the data are drawn. If all were alike, each hyperparameter
+# beside a chain would push the rest of it aside, and a picture of 19 functions would be half as wide again.
+_FLOW_WEIGHT: Final = "8"
 # Graphviz keeps global state, so only one thread may be in it.
 _engine_lock = threading.Lock()
 
@@ -177,7 +186,8 @@ def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[
     for tail, head in edges:
         # The edges of a block leave or enter it where those of its members meet.
         ends = f"v{tail}:s" if tail in blocks else f"v{tail}", f"v{head}:n" if head in blocks else f"v{head}"
-        dot.edge(*ends, arrowhead="none" if head in blocks else None)
+        weight = None if tail in blocks or boxes[tail].shape == "hexagon" else _FLOW_WEIGHT
+        dot.edge(*ends, arrowhead="none" if head in blocks else None, weight=weight)
     for tail, head in back:
         dot.edge(f"v{tail}", f"v{head}", constraint="false")
     return str(dot.source)
@@ -389,6 +399,8 @@ def _arc(boxes: Sequence[Box], centres: Sequence[Point], edge: Edge) -> Way:
 
 # The edges of so many can still be followed.
 _MOST_APART: Final = 4
+# In a narrow picture so many stand one below the other: as high as a thumbnail and what is around it.
+_MOST_STACKED: Final = 5
 # What fits into this width stands in one row.
 _ROW_PX: Final = 500.0
 # Under a row, where its edges meet.
@@ -451,14 +463,19 @@ class Folded(NamedTuple):
         return self.place[edge[0]], self.place[edge[1]]
 
 
-def fold(boxes: Sequence[Box], edges: Sequence[Edge], apart: Collection[int] = ()) -> Folded:
+def fold(
+    boxes: Sequence[Box], edges: Sequence[Edge], apart: Collection[int] = (), *, is_narrow: bool = False
+) -> Folded:
     """Put sources, or sinks, of one shape and with exactly the same neighbours into blocks, if they are many.
 
-    Those that stand ``apart`` are in none.
+    Those that stand ``apart`` are in none. In a narrow picture two sources are many, and a few are a stack.
     """
     turned = [(head, tail) for tail, head in edges]
-    blocks = [_arranged(boxes, _rows(boxes, members)) for members in _alike(boxes, edges, apart)]
-    blocks += [_upside_down(boxes, _rows(boxes, members)) for members in _alike(boxes, turned, apart)]
+    blocks = [
+        _arranged(boxes, [*zip(members)] if is_narrow and len(members) <= _MOST_STACKED else _rows(boxes, members))
+        for members in _alike(boxes, edges, apart, 1 if is_narrow else _MOST_APART)
+    ]
+    blocks += [_upside_down(boxes, _rows(boxes, members)) for members in _alike(boxes, turned, apart, _MOST_APART)]
     hidden = {member for block in blocks for member in block.members}
     left = [vertex for vertex in range(len(boxes)) if vertex not in hidden]
     place = {vertex: index for index, vertex in enumerate(left)}
@@ -502,8 +519,8 @@ def _unfolded(layout: Layout, graph: Folded, edges: Sequence[Edge], routed: Sequ
     return Layout(layout.width, layout.height, tuple(centres), tuple(splines))
 
 
-def _alike(boxes: Sequence[Box], edges: Sequence[Edge], apart: Collection[int]) -> list[tuple[int, ...]]:
-    """Return the sources that lead to the same vertices and have the same shape, where they are many.
+def _alike(boxes: Sequence[Box], edges: Sequence[Edge], apart: Collection[int], few: int) -> list[tuple[int, ...]]:
+    """Return the sources that lead to the same vertices and have the same shape, where they are more than few.
 
     If all edges are turned, they are sinks.
     """
@@ -513,7 +530,7 @@ def _alike(boxes: Sequence[Box], edges: Sequence[Edge], apart: Collection[int]) 
     groups: dict[tuple[str, frozenset[int]], list[int]] = {}
     for vertex in sorted(heads.keys() - {head for _, head in edges} - set(apart)):
         groups.setdefault((boxes[vertex].shape, frozenset(heads[vertex])), []).append(vertex)
-    return [tuple(members) for members in groups.values() if len(members) > _MOST_APART]
+    return [tuple(members) for members in groups.values() if len(members) > few]
 
 
 def _rows(boxes: Sequence[Box], members: tuple[int, ...]) -> list[tuple[int, ...]]:
@@ -567,7 +584,7 @@ def _columns(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: floa
     column, count = max(boxes[member].width for member in members), max(map(len, rows))
     lanes = _lanes(count, column)
     heights = [max(boxes[member].height for member in row) for row in rows]
-    height = sum(heights) + _ROW_GAP_PX * len(rows) + (_MEETING_PX if len(lanes) > 1 else 0.0)
+    height = sum(heights) + _ROW_GAP_PX * len(rows) + (_MEETING_PX if any(lanes) else 0.0)
     offsets: list[Point] = []
     ways: list[Way] = []
     middles: list[float] = []
@@ -581,12 +598,14 @@ def _columns(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: floa
             out = lane + side * _LANE_PX / 2
             offsets.append((out + side * boxes[member].width / 2, middles[number]))
             ways.append(_way(out - side * tip_px, lane, middles[number:], height / 2))
-    width = lanes[-1] - lanes[0] + 2 * column + _LANE_PX
+    width = lanes[-1] - lanes[0] + min(count, 2) * column + _LANE_PX
     return Block(Box("box", width, height), members, tuple(offsets), tuple(ways))
 
 
 def _lanes(columns: int, column_px: float) -> list[float]:
     """Return where the lanes between columns are, from the middle of them all."""
+    if columns == 1:
+        return [-column_px / 2]
     pairs, pitch = columns // 2, 2 * column_px + _LANE_PX + _COLUMN_GAP_PX
     lanes = [pitch * (pair - (pairs - 1) / 2) for pair in range(pairs)]
     if columns % 2:

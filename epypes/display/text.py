@@ -12,10 +12,13 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
-CHARACTERS: Final = 20_000
+# Of a page, with its script and style.
+CHARACTERS: Final = 30_000
 CHARACTERS_OF_A_VERTEX: Final = 600
 # All thumbnails of a picture. Base64 makes four characters of three bytes.
 THUMBNAIL_CHARACTERS: Final = 80_000
+# All pictures that a page keeps beside them, to be looked at closely.
+KEPT_CHARACTERS: Final = 150_000
 # More are no overview.
 MOST_THUMBNAILS: Final = 24
 

@@ -305,7 +305,12 @@ class EventLoop(OldNames):
             return stop.is_set()
 
     def _report(self, event: Any, exception: BaseException) -> None:
+        is_taken = self._pipeline is not None and self._pipeline._take_failure(
+            event, exception, is_reported=self.on_error is not None
+        )
         if self.on_error is None:
+            if is_taken:
+                return
             log_error("%s: an event failed", self.name, error=exception)
             return
         try:

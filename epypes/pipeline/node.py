@@ -63,6 +63,7 @@ class Node(OldNames):
 
     def __call__(self, *args: Any) -> Any:
         """Compute, and measure the time."""
+        __tracebackhide__ = True
         start_ns = perf_counter_ns()
         try:
             return self.compute(*args)
@@ -98,6 +99,7 @@ class Node(OldNames):
 
     def compute(self, *args: Any) -> Any:
         """Compute the node's value from its inputs; the hook for subclasses."""
+        __tracebackhide__ = True
         return self.func(*args)
 
     @property

@@ -11,7 +11,7 @@ from time import perf_counter_ns
 from typing import Any, Literal
 
 from epypes.deprecation import takes_old_keywords
-from epypes.errors import HyperparameterError, PayloadError
+from epypes.errors import HyperparameterError, PayloadError, run_call
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
 from epypes.pipeline.node import Node, NodeBasedCompGraph
@@ -153,8 +153,12 @@ class Pipeline(Node, TokenMapping):
         """What an event passes before and after the graph, as it is at this moment; the hook for subclasses."""
         return Stages()
 
-    def run(self, /, **payload: Any) -> Run:
+    def run(self, /, *positional: Any, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
+        __tracebackhide__ = True
+        if positional:
+            free = self.runner.free_source_tokens
+            raise PayloadError(free, f"Payload goes by name: {run_call(free)}.")
         start_ns = perf_counter_ns()
         # In place before the run, whose functions fill the caches: after it each look-up takes a microsecond.
         self._called = called = [*self._called]
@@ -168,12 +172,14 @@ class Pipeline(Node, TokenMapping):
 
     def __call__(self, *args: Any) -> Any:
         """Run the graph on the free source tokens, in order; return its sink token or tokens."""
+        __tracebackhide__ = True
         run = self.run(**self._by_name(args))
         sinks = tuple(run[token] for token in self.cg.sink_tokens)
         return sinks[0] if len(sinks) == 1 else sinks
 
     def compute(self, *args: Any) -> Any:
         """Run the graph on one payload, a mapping by token; the hook for subclasses."""
+        __tracebackhide__ = True
         (payload,) = args
         return self.runner.run_on(payload)
 
@@ -182,6 +188,10 @@ class Pipeline(Node, TokenMapping):
     def _reaction(self, f_in: Callable[[Any], Mapping[str, Any]] | None) -> Callable[[Any], object]:
         """Return what is called with each event: without f_in the event is the only input."""
         return self if f_in is None else lambda event: self.run(**f_in(event))
+
+    def _take_failure(self, event: Any, exception: BaseException, *, is_reported: bool) -> bool:
+        """Count an event whose reaction raised, and report it unless the loop does; return whether that was done."""
+        return False
 
     def _has_settled(self, event: Any) -> bool:
         """Whether the pipeline has acknowledged or rejected the event itself."""
@@ -236,7 +246,7 @@ class Pipeline(Node, TokenMapping):
     def _require_allowed(self, token: str, value: Any) -> None:
         for hint in annotated_params(self.source_cg, token):
             if not _allows(hint, value):
-                text = f"{token}={value!r:.60} is not what its annotation allows: {hint!r:.200}. Nothing was set."
+                text = f"{token}={value!r:.60} is not what its annotation allows, {hint.describe()}. Nothing was set."
                 raise HyperparameterError(token, text)
 
     def stop(self) -> None:

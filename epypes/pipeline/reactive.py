@@ -171,6 +171,31 @@ class _Reactive(Pipeline):
     # Where the last event that failed did so, what was raised, and how many had been worked on.
     _failed_last: tuple[str, str, int] = ("", "", 0)
 
+    def emit(self, event: Any, run: Run) -> None:
+        """Do something with an event's run; a pipeline without q_out does nothing. The hook for subclasses."""
+
+    def put(self, answer: Any, view: EventView) -> None:
+        """Put an answer on q_out; a pipeline without one does nothing. The hook for subclasses."""
+
+    def _failure_after(self, view: EventView, run: Run, exception: BaseException) -> Failure:
+        """Describe what failed after the graph: f_out and the put on q_out, or a hook of one's own."""
+        function = "f_out"
+        if view.stage == "q_out" and self._is_own("put"):
+            function = "put"
+        elif view.stage == "f_out" and self._is_own("emit") and bool(view.f_out_start) == bool(view.f_out_end):
+            function = "emit"
+        return Failure(function, self.cg.sink_tokens, dict(run), exception)
+
+    def _is_own(self, hook: str) -> bool:
+        """Whether a hook is that of a user's subclass, or was set on this object."""
+        return hook in vars(self) or not getattr(type(self), hook).__module__.startswith("epypes.pipeline.")
+
+    def _note_failure(self, where: str, failure: Failure) -> None:
+        """Remember for the picture where the last event failed."""
+        # The text alone: the exception would keep the event and all its tokens.
+        named = f"{failure.function}: " if failure.function in ("emit", "put") else ""
+        self._failed_last = where, f"{named}{failure.kind}: {failure.message}", self.run_count
+
     def _where(self) -> list[str]:
         """Return where the events under way are: one, unless several threads work on events."""
         return [view.stage for view in tuple(self._events.values()) if view.stage]
@@ -192,6 +217,7 @@ class _Answering(_Reactive):
 
     def emit(self, event: Any, run: Run) -> None:
         """Put what f_out makes of the event's run on q_out. The hook for subclasses."""
+        __tracebackhide__ = True
         view = self._events.get(get_ident())
         if view is None or view.event is not event:
             view = EventView(self.name, event, "f_out")
@@ -201,6 +227,8 @@ class _Answering(_Reactive):
         view.f_out_end = perf_counter_ns()
         view.stage = "q_out"
         self.put(answer, view)
+        # What emit of a subclass does after this.
+        view.stage = "f_out"
 
     def put(self, answer: Any, view: EventView) -> None:
         """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
@@ -239,14 +267,18 @@ class SourcePipeline(_Answering):
         self.q_out, self.f_out = q_out, f_out
         self._events = {}
 
-    def run(self, /, **payload: Any) -> Run:
+    def run(self, /, *positional: Any, **payload: Any) -> Run:
         """Run the graph on a payload and put the result on q_out."""
+        __tracebackhide__ = True
         view = EventView(self.name, None, "f_out")
-        run = super().run(**payload)
+        run = super().run(*positional, **payload)
         # Only now: the graph may run this pipeline itself, on this thread.
         self._events[get_ident()] = view
         try:
             self.emit(None, run)
+        except BaseException as exception:
+            self._note_failure("f_out", self._failure_after(view, run, exception))
+            raise
         finally:
             self._events.pop(get_ident(), None)
         return run
@@ -273,8 +305,8 @@ class SinkPipeline(_Reactive):
     Attributes
     ----------
     on_error
-        None, or called with a Failure on the loop's thread when f_in, a function or f_out raises. Without it,
-        failures are logged. The loop goes on.
+        None, or called with a Failure on the loop's thread when f_in, a function, f_out or a hook of a subclass raises.
+        Without it, failures are logged. The loop goes on.
     failed
         How many events failed.
     """
@@ -331,7 +363,8 @@ class SinkPipeline(_Reactive):
         self._events[thread] = view
         f_in = self._f_ins.get(thread, self.f_in) if self._f_ins else self.f_in
         # Looked up now: a function of the graph fills the caches with its image, and each look-up takes microseconds.
-        clock, f_out, put = perf_counter_ns, self.f_out if self._has_usual_emit else None, self.put
+        is_usual = self._has_usual_emit and "emit" not in self.__dict__
+        clock, f_out, put = perf_counter_ns, self.f_out if is_usual else None, self.put
         # To free the tokens of the run before takes its time: that is done when the answer is on its way.
         before = self.runner.last
         run: Run | None = None
@@ -380,24 +413,16 @@ class SinkPipeline(_Reactive):
         loop = Stage("loop", "EventLoop", state, notes)
         return Stages(before=(queue_stage("q_in", self.q_in), loop, self._function_stage("f_in")))
 
-    def emit(self, event: Any, run: Run) -> None:
-        """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
-
-    def put(self, answer: Any, view: EventView) -> None:
-        """Put an answer on q_out; a SinkPipeline has none. The hook for subclasses."""
-
     def _fail(self, view: EventView, exception: BaseException, run: Run | None) -> None:
         event, where = view.event, "f_out" if view.stage == "q_out" else view.stage
-        view.stage = ""
         self.failed += 1
         try:
-            where, failure = self._failure_of(event, where, exception, run)
+            where, failure = self._failure_of(view, where, exception, run)
         except BaseException:  # whatever a run of one's own does, the failure is reported
             failure = Failure(where, (), {"event": event}, exception)
-        # The text alone: the exception would keep the event and all its tokens.
-        self._failed_last = where, f"{failure.kind}: {failure.message}", self.run_count
-        failed_id = event_id(event)
-        self._report(replace(failure, event_id=failed_id, attempt=self._attempts.count(failed_id), source=self.name))
+        view.stage = ""
+        self._note_failure(where, failure)
+        self._report(failure, event)
         # When it has been reported: a broker may have nothing else to do with the event.
         if is_kept(event):
             self._settle(event, exception, str(failure))
@@ -410,19 +435,29 @@ class SinkPipeline(_Reactive):
         """Whether ``handle`` has settled the event: that of a subclass need not call this one's."""
         return vars(self._settled).pop("event", None) is event
 
-    def _failure_of(self, event: Any, where: str, exception: BaseException, run: Run | None) -> tuple[str, Failure]:
+    def _failure_of(
+        self, view: EventView, where: str, exception: BaseException, run: Run | None
+    ) -> tuple[str, Failure]:
         """Return what failed, and where."""
         failed = self.runner.failed_run(exception) if where == "graph" else None
         if failed is not None and failed.failure is not None:
             return where, failed.failure
         if run is not None:
-            return where, Failure("f_out", self.cg.sink_tokens, dict(run), exception)
+            return where, self._failure_after(view, run, exception)
         # What the graph refuses to run on came from f_in; anything else was raised by a compute of one's own.
         where = "f_in" if issubclass(type(exception), EpypesError) else where
         function = "compute" if where == "graph" else "f_in"
-        return where, Failure(function, self.runner.free_source_tokens, {"event": event}, exception)
+        return where, Failure(function, self.runner.free_source_tokens, {"event": view.event}, exception)
 
-    def _report(self, failure: Failure) -> None:
+    def _take_failure(self, event: Any, exception: BaseException, *, is_reported: bool) -> bool:
+        self.failed += 1
+        if not is_reported:
+            self._report(Failure("handle", self.runner.free_source_tokens, {"event": event}, exception), event)
+        return True
+
+    def _report(self, failure: Failure, event: Any) -> None:
+        failed_id = event_id(event)
+        failure = replace(failure, event_id=failed_id, attempt=self._attempts.count(failed_id), source=self.name)
         if self.on_error is None:
             expected = issubclass(type(failure.exception), EpypesError)
             log_error("%s: an event failed in %s", self.name, failure, error=None if expected else failure.exception)

@@ -28,6 +28,7 @@ def call(program: Program, step: Step, values: Sequence[Any], durations_ns: dict
     ContractBroken, InputMutated, IteratorRefused
         It does not keep to its contract, changed an object inside an input, or returned what can be read only once.
     """
+    __tracebackhide__ = True
     # Unpacked at once: to look up one field of a named tuple takes as long.
     place, _, function, inputs, outputs, single, _, switch, contracts, is_plain, node, _ = step
     if node is not None:
@@ -81,6 +82,7 @@ def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
 
 def _call_checked(program: Program, step: Step, function: Callable[..., Any], values: Sequence[Any], *args: Any) -> Any:
     """Call a step's function; put back what it has changed of its inputs, and raise InputMutated."""
+    __tracebackhide__ = True
     given = {program.tokens[slot]: values[slot] for slot in step.inputs}
     if step.unguarded:  # which can write into memory that is locked for others
         views = zip(step.inputs, args, strict=True)

@@ -36,6 +36,7 @@ from epypes.run.guard import (
 from epypes.run.program import Program, Step
 from epypes.run.staleness import TokenManager, is_unchanged
 from epypes.run.timing import longest_path_ns
+from epypes.tracebacks import HIDE
 
 # Runs steps, and writes nanoseconds by step. What a step raises is raised; it is the step ``tokens.running``.
 Way = Callable[[TokenManager], None]
@@ -101,10 +102,12 @@ class Executor:
 
     def _in_turn(self, key: Key, tokens: TokenManager) -> None:
         """Run the dirty steps on this thread."""
+        __tracebackhide__ = True
         (self._compiled.get(key) or self._compile(key, tokens) or self._one_by_one)(tokens)
 
     def _one_by_one(self, tokens: TokenManager) -> None:
         """Run the dirty steps one by one, and learn the types of the values."""
+        __tracebackhide__ = True
         run_one_by_one(tokens)
         if len(self._program.steps) <= _MAX_STEPS:
             kinds = [*map(type, tokens.values)]
@@ -136,6 +139,7 @@ class Executor:
 
 def run_one_by_one(tokens: TokenManager) -> None:
     """Run the dirty steps that are wanted, in run order."""
+    __tracebackhide__ = True
     program, values, wanted, next_dirty = tokens.program, tokens.values, tokens.wanted, tokens.begin().dirty.find
     steps, store, durations_ns = program.steps, tokens.store, tokens.durations_ns
     # What depends on a step comes after it, so one pass over the flags finds everything.
@@ -154,6 +158,7 @@ def run_one_by_one(tokens: TokenManager) -> None:
 
 def go_on_one_by_one(tokens: TokenManager) -> None:
     """Run the dirty steps that a compiled run has not come to, which was given Nothing."""
+    __tracebackhide__ = True
     durations_ns = tokens.durations_ns
     tokens.dirty = bytes(left and at not in durations_ns for at, left in enumerate(tokens.dirty))
     # What was new to any step is not known: a compiled run does not write it down.
@@ -230,7 +235,7 @@ class _Source:
             f"def make(program, steps, {', '.join(_NAMES)}, array, dirty, left):",
             *(f"    f{step.place} = steps[{step.place}].function" for step in self._steps),
             # As arguments they stand side by side in the frame: each variable of ``make`` is an object of its own.
-            f"    def run(t, {', '.join(f'{name}={name}' for name in _FREQUENT)}):",
+            f"    def run(t, {', '.join(f'{name}={name}' for name in _FREQUENT)}, {HIDE}=True):",
             "        start = 0; v = t.values; d = t.durations_ns",
             "        D = t.dirty = bytearray(dirty)" if self._has_flags else "        t.dirty = dirty",
             "        try:",
@@ -245,7 +250,7 @@ class _Source:
             "        go_on(t)",
             "    return run",
         ]
-        names: dict[str, Any] = {}
+        names: dict[str, Any] = {"__name__": __name__}
         exec(compile("\n".join(lines), "<epypes: a compiled run>", "exec"), names)  # noqa: S102 - numbers only
         run: Way = names["make"](
             self._program, self._program.steps, *_NAMES.values(), self._array, self._certain, self._left
@@ -452,6 +457,7 @@ class SideBySide:
 
     def run(self) -> None:
         """Run all steps; raise what the first failed one in run order has raised."""
+        __tracebackhide__ = True
         tokens = self._tokens
         for _ in range(min(self._workers, self._count) - 1):
             # numpy's errstate, for one, belongs to the context.
@@ -481,6 +487,7 @@ class SideBySide:
 
     def _work(self) -> None:
         """Call what is ready, the first in run order first, until nothing is left."""
+        __tracebackhide__ = True
         with self._changed:
             while not self._is_over:
                 if self._ready and not (self._failures and self._ready[0] > min(self._failures)):
@@ -492,6 +499,7 @@ class SideBySide:
             self._changed.notify_all()
 
     def _call(self, place: int) -> None:
+        __tracebackhide__ = True
         tokens = self._tokens
         program, mark = tokens.program, _Call(place)
         step = program.steps[place]
@@ -559,6 +567,7 @@ class Gain:
 
     def run(self, tokens: TokenManager) -> None:
         """Run the steps in the way that seems to be the faster one."""
+        __tracebackhide__ = True
         start_ns, side_by_side = perf_counter_ns(), self.is_worth_it()
         if side_by_side:
             SideBySide(tokens, self._workers).run()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
@@ -13,6 +13,8 @@ from typing import Any, Final
 from epypes.run.guard import explain_write, is_array, lend_to_reader
 from epypes.run.snapshot import is_numpy_scalar
 from epypes.run.staleness import TokenManager
+from epypes.tracebacks import fold_end
+from epypes.wording import error_message
 
 # A note is one line that names the culprit, so a value in it is short.
 _BRIEF: Final = 40
@@ -20,23 +22,24 @@ _NUMBERS: Final = frozenset((bool, int, float, complex, type(None)))
 _CONTAINERS: Final = frozenset((list, tuple, dict, set, frozenset, deque, bytes, bytearray))
 # Of so many items the types are looked at.
 _MOST_ITEMS: Final = 1_000
-# OpenCV begins its messages with its version and the place in its own source; what went wrong comes after.
-_OPENCV_PLACE: Final = re.compile(r"^OpenCV\([^)]*\) \S+ error: ")
+# What functions say that have got None for an image: Python's own operations, and those of OpenCV.
+_OF_NONE: Final = re.compile(r"None|\bempty\b|OpenCV\(")
+_WAS_IT_FOUND: Final = "Was the file found? cv2.imread returns None for a file that it can't read."
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A function that raised, or a reactive pipeline's f_in, f_out or compute.
+    """A function that raised, or a reactive pipeline's f_in, f_out, or hook of its own.
 
     Attributes
     ----------
     function
         Its name in the graph; ``"f_in"`` also for a payload that the graph refuses, ``"f_out"`` also for the put of the
-        answer, ``"compute"`` for what a subclass does around its graph.
+        answer. ``"compute"``, ``"emit"``, ``"put"`` and ``"handle"`` are hooks of a subclass.
     tokens
         Its input tokens, then its output tokens.
     inputs
-        The values that it was called with, by token; by ``"event"`` for f_in and compute.
+        The values that it was called with, by token; by ``"event"`` for f_in, compute and handle.
     exception
         What it raised, unchanged.
     event_id
@@ -45,6 +48,9 @@ class Failure:
         Which try of the event with that id this was, from 1, as far as failures are remembered.
     source
         Name of the pipeline that worked on it; empty if it was none that answers events.
+    cause
+        What is likely wrong with the inputs, as a sentence: a None in place of an image, a value that an annotation or
+        the catalog of library functions does not allow. Empty if nothing is.
     """
 
     function: str
@@ -54,6 +60,7 @@ class Failure:
     event_id: str = ""
     attempt: int = 1
     source: str = ""
+    cause: str = ""
 
     @property
     def kind(self) -> str:
@@ -64,13 +71,8 @@ class Failure:
 
     @property
     def message(self) -> str:
-        """The text of the exception, without OpenCV's place in its own source."""
-        try:
-            # A plain string, whatever methods the one that is returned has.
-            text = str.__str__(str(self.exception)).strip()
-        except BaseException:  # an exception's own __str__ may raise
-            text = "(its message can't be had)"
-        return _OPENCV_PLACE.sub("", text)
+        """The likely cause, then the text of the exception, without OpenCV's place in its own source."""
+        return f"{self.cause} {error_message(self.exception)}".strip()
 
     def __str__(self) -> str:
         text = self.message
@@ -83,22 +85,26 @@ class Failure:
             raised = f"<{self.kind}>"
         return (
             f"Failure(function={self.function!r}, tokens={self.tokens!r}, exception={raised}, "
-            f"event_id={self.event_id!r}, attempt={self.attempt!r}, source={self.source!r})"
+            f"event_id={self.event_id!r}, attempt={self.attempt!r}, source={self.source!r}, cause={self.cause!r})"
         )
 
 
-def failure_of(tokens: TokenManager, place: int, exception: BaseException) -> Failure:
-    """Describe the failure of a step, and note on the user's exception which function and tokens it concerns."""
+def failure_of(tokens: TokenManager, place: int, exception: BaseException, frozen: Collection[str]) -> Failure:
+    """Describe the failure of a step, and note on the user's exception which function and tokens it concerns.
+
+    ``frozen`` are the hyperparameters.
+    """
     names, step = tokens.program.tokens, tokens.program.steps[place]
     inputs = tuple(names[slot] for slot in step.inputs)
     outputs = tuple(names[slot] for slot in step.outputs)
     values = {token: _lent(tokens.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
     given = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
     begin, end = f"In function {step.name!r}: (", f") -> ({', '.join(outputs)})"
-    note = f"{begin}{given}{end}"
+    note, cause = f"{begin}{given}{end}", ""
     # Whatever the exception's own methods do, the failure is reported.
     with contextlib.suppress(BaseException):
-        why = None if step.unguarded else explain_write(step.name, inputs, exception)
+        cause = " ".join(_causes(tokens, place, exception, frozen))
+        why = cause or (None if step.unguarded else explain_write(step.name, inputs, exception))
         note = f"{note}\n{why}" if why else note
     with contextlib.suppress(BaseException):
         # One exception may be raised for event after event, with other values each time.
@@ -106,7 +112,26 @@ def failure_of(tokens: TokenManager, place: int, exception: BaseException) -> Fa
             if earlier.startswith(begin) and earlier.partition("\n")[0].endswith(end):
                 exception.__notes__.remove(earlier)
         exception.add_note(note)
-    return Failure(step.name, (*inputs, *outputs), values, exception)
+        fold_end(exception)
+    return Failure(step.name, (*inputs, *outputs), values, exception, cause=cause)
+
+
+def _causes(tokens: TokenManager, place: int, exception: BaseException, frozen: Collection[str]) -> Iterator[str]:
+    """Say which inputs of a step likely made it fail: None in place of an image, or forbidden values."""
+    # Not before a function has failed: it reads the catalog, and the function's source.
+    from epypes.catalog import reason_against
+
+    program, step = tokens.program, tokens.program.steps[place]
+    for slot in step.inputs:
+        token, value = program.tokens[slot], tokens.values[slot]
+        if value is None and token not in frozen and _OF_NONE.search(str(exception)):
+            maker = program.makers[slot]
+            made = f", made by function {program.steps[maker].name!r}" if maker >= 0 else ""
+            yield f"{token} is None{made}. {_WAS_IT_FOUND}"
+        elif value is not None and (type(value) in _NUMBERS or is_numpy_scalar(type(value))):
+            reason = reason_against(program.cg, step.name, token, value)
+            if reason:
+                yield f"{token}{_brief(value)}: {reason}."
 
 
 def _brief(value: Any) -> str:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
-from epypes.errors import HyperparameterError, PayloadError, UnknownName
+from epypes.errors import HyperparameterError, PayloadError, UnknownName, nearest, run_call
 from epypes.run.guard import ARRAYLESS, COPIERS, keep, require_reusable
 from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, TokenManager, is_same_value, new_tokens
+
+# Of a longer value an error has dots.
+_BRIEF: Final = 40
 
 
 class Hyperparameters:
@@ -139,7 +142,7 @@ class Hyperparameters:
         for token, value in payload.items():
             slot = free.get(token)
             if slot is None:
-                raise self._wrong_payload(token)
+                raise self._wrong_payload(token, value, free)
             values[slot] = value
             if type(value) not in COPIERS:
                 require_reusable(value, program, slot)
@@ -187,18 +190,26 @@ class Hyperparameters:
             f"Pass it to run({token}=...), or make it one: freeze({token}=...).",
         )
 
-    def _wrong_payload(self, token: str) -> Exception:
+    def _wrong_payload(self, token: str, value: Any, free: Iterable[str]) -> Exception:
         """Return the error that says why a token can't be given to ``run``."""
         cg = self.program.cg
-        if token not in cg.tokens:
-            return UnknownName("token", token, self.free_slots)
+        text = repr(value) if type(value) in ARRAYLESS else ""
+        text = text if 0 < len(text) <= _BRIEF else "..."
+
+        def change(name: str) -> str:
+            return f"Change it with rerun({name}={text}), or with runner[{name!r}] = {text} before {run_call(free)}."
+
+        if not cg.has_token(token):
+            near = nearest(token, (*free, *self.entries))
+            advice = f" Did you mean the hyperparameter {near!r}? {change(near)}" if near in self.entries else ""
+            return UnknownName("token", token, free, advice=advice)
         maker = cg.digraph.producer.get(token)
         if maker is not None:
             text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
         elif token in cg.delays:
             text = _is_delayed(token, cg.delays[token].token)
         else:
-            text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
+            text = f"Token {token!r} is a hyperparameter, which run() does not take. {change(token)}"
         return PayloadError((token,), text)
 
 

@@ -287,6 +287,7 @@ def _with_state_slots(steps: Iterable[Step], count: int, states: list[StateSlots
 
 
 def _call_with_state(function: Any, keys: tuple[str, ...], single: bool, *args: Any) -> Any:
+    __tracebackhide__ = True
     inputs, state = args[: -len(keys)], args[-len(keys) :]
     value, after = getattr(function, CALL_WITH_STATE)(dict(zip(keys, state, strict=True)), inputs)
     made = (

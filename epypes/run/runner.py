@@ -152,10 +152,12 @@ class CompGraphRunner(OldNames, TokenMapping):
         Exception
             Whatever a function raises, unchanged, with a note; ``last`` is then the failed run.
         """
+        __tracebackhide__ = True
         return self.run_on(payload, targets)
 
     def run_on(self, payload: Payload, targets: Sequence[str] = ()) -> Run:
         """Do what ``run`` does, with the payload as a mapping by free source token."""
+        __tracebackhide__ = True
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
@@ -179,6 +181,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         Exception
             Whatever a function raises, unchanged, with a note.
         """
+        __tracebackhide__ = True
         if not self._program.states:
             return self._go_on(changes, targets)
         with self._series:
@@ -186,6 +189,7 @@ class CompGraphRunner(OldNames, TokenMapping):
 
     def _go_on(self, changes: Mapping[str, Any], targets: tuple[str, ...], is_trial: bool = False) -> Run:
         """Change hyperparameters, and run the stale functions on the tokens of the last run."""
+        __tracebackhide__ = True
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
@@ -227,6 +231,7 @@ class CompGraphRunner(OldNames, TokenMapping):
 
         The run becomes the last one unless it is a trial. With a way, that is taken in place of the executor's.
         """
+        __tracebackhide__ = True
         program, failed_at, error, failure = self._program, -1, None, None
         if way is None:
             if targets or program.is_conditional or not tokens.has_payload:
@@ -243,7 +248,7 @@ class CompGraphRunner(OldNames, TokenMapping):
             running.discard(tokens)
         if error is not None:
             failed_at = max(0, tokens.running)
-            failure = _failed(tokens, failed_at, error)
+            failure = _failed(tokens, failed_at, error, hparams)
         skipped = skipped_steps(program, tokens.values, tokens.dirty) if program.has_skipped else ()
         total_ns = perf_counter_ns() - start_ns
         kept_ns = packed(program, durations_ns) if program.is_large else durations_ns
@@ -453,6 +458,7 @@ class CompGraphRunner(OldNames, TokenMapping):
 
     def call_with_state(self, state: Mapping[str, Any], call: Callable[[], Any]) -> tuple[Any, Mapping[str, Any]]:
         """Call what runs this graph with a state that the caller keeps; return its value and the state after."""
+        __tracebackhide__ = True
         with self._series:
             own = self._kept
             self.state = state
@@ -618,7 +624,7 @@ def stop_at(
         return runner.last
 
 
-def _failed(tokens: TokenManager, place: int, error: BaseException) -> Failure:
+def _failed(tokens: TokenManager, place: int, error: BaseException, hparams: Hyperparameters) -> Failure:
     """Describe the failure of a step; what depends on it reads as not computed.
 
     Of the steps that were not reached none was reused: they were not wanted.
@@ -626,7 +632,7 @@ def _failed(tokens: TokenManager, place: int, error: BaseException) -> Failure:
     program, durations_ns = tokens.program, tokens.durations_ns
     durations_ns.setdefault(place, 0)
     tokens.dirty = bytearray(left and at not in durations_ns for at, left in enumerate(tokens.dirty))
-    failure = failure_of(tokens, place, error)
+    failure = failure_of(tokens, place, error, hparams.entries)
     tokens.forget(program.downstream([place], tokens.values))
     reached = bytearray(tokens.wanted or program.all_steps)
     for stale in tokens.stale:

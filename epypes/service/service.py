@@ -53,8 +53,8 @@ class Service:
 
     Attributes
     ----------
-    http, token_file
-        Its HTTP address, and the file of the token for that; set by the HTTP server.
+    http, access_key_file
+        Its HTTP address, and the file of the access key for that; set by the HTTP server.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class Service:
             raise ServiceError(bundle.path, reason)
         self.path, self.threads = bundle.path, given.threads
         self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
-        self.http = self.token_file = ""
+        self.http = self.access_key_file = ""
         self.failure_store = FailureStore(failures_folder(bundle.path))
         self.event_log = EventLog(given, bundle.settings.name, self._provenance)
         answers = AnswerOutput(given.pub, given, self._changed)
@@ -144,7 +144,7 @@ class Service:
             self._supervisor.bundle.digest,
             addresses["failures"],
             self.http,
-            self.token_file,
+            self.access_key_file,
             self.options.replica,
             self.options.shows_failures,
             str(self._supervisor.bundle.path),

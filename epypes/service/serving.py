@@ -29,7 +29,7 @@ def serve(
     pub: str,
     *,
     http: str = "",
-    token_file: str | Path | None = None,
+    access_key_file: str | Path | None = None,
     insecure: bool = False,
     on_ready: Callable[[ServiceState], None] = lambda state: None,
     on_fault: Callable[[str], None] = lambda reason: None,
@@ -41,8 +41,8 @@ def serve(
     ----------
     http
         Address of the HTTP control, as ``127.0.0.1:8642``; none without.
-    token_file
-        The file of the token for that; one is made without.
+    access_key_file
+        The file of the access key for that; one is made without.
     on_ready
         Called when events are answered.
     on_fault
@@ -67,7 +67,7 @@ def serve(
     with SignalWait() as signals, _lock(path, given) as lock, ExitStack() as control:
         service = Service(path, sub, pub, insecure=insecure, **{**options, "replica": lock.replica})
         if http:
-            _serve_http(service, http, token_file, insecure, control)
+            _serve_http(service, http, access_key_file, insecure, control)
         fault: list[str] = []
         if signals.wait_during(service.start):
             fault = _announce(service, lock, None if http else signals.now, on_ready, on_fault)
@@ -86,12 +86,12 @@ def _lock(path: str | Path, options: Options) -> StateLock:
 
 
 def _serve_http(
-    service: Service, address: str, token_file: str | Path | None, insecure: bool, control: ExitStack
+    service: Service, address: str, access_key_file: str | Path | None, insecure: bool, control: ExitStack
 ) -> None:
     from epypes.service.http import HttpServer
 
-    server = HttpServer(service, address, token_file=token_file, insecure=insecure)
-    service.http, service.token_file = server.start(), str(server.token_file)
+    server = HttpServer(service, address, access_key_file=access_key_file, insecure=insecure)
+    service.http, service.access_key_file = server.start(), str(server.access_key_file)
     control.callback(server.stop)
 
 

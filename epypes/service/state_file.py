@@ -45,8 +45,8 @@ class ServiceState:
         Address of failures.
     http
         Address of its HTTP control; empty without.
-    token_file
-        The file of the token for that.
+    access_key_file
+        The file of the access key for that.
     replica
         Name among the services of the bundle; empty for a service that stands alone.
     shows_failures
@@ -61,7 +61,7 @@ class ServiceState:
     digest: str
     failures: str = ""
     http: str = ""
-    token_file: str = ""
+    access_key_file: str = ""
     replica: str = ""
     shows_failures: bool = True
     bundle: str = ""

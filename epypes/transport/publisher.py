@@ -450,6 +450,8 @@ class Outbox:
         # The item's own code, called to make bytes of it, may raise anything.
         reason = reason or type(error).__name__
         self.rejected[reason] += 1
+        if isinstance(error, KeyboardInterrupt):  # the user's, who sees it raised: nothing is wrong with the item
+            return
         kind = "" if item is None else f" of type {type(item).__name__}"
         self._log.warning(reason, f"{self._name} rejected an item{kind} ({reason}): {text}")
 

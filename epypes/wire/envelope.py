@@ -183,7 +183,7 @@ def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -
         function=_sendable(failure.function),
         tokens=tuple(map(_sendable, failure.tokens)),
         exception=_sendable(failure.kind),
-        message=_sendable(" | ".join([failure.message, *_notes(failure.exception)])),
+        message=_sendable(" | ".join([failure.message, *_notes(failure)])),
         input_id=input_id,
         attempt=failure.attempt,
     )
@@ -191,12 +191,14 @@ def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -
     return Envelope(FAILURE, source=sender, correlation_id=input_id, bundle_digest=bundle_digest, failure=record)
 
 
-def _notes(exception: BaseException) -> list[str]:
+def _notes(failure: Failure) -> list[str]:
+    """Return the notes on the exception of a failure, without its cause, which the message begins with."""
     # The exception's own attributes are user code, which may raise anything.
     with contextlib.suppress(BaseException):
-        notes = getattr(exception, "__notes__", None)
+        notes, cause = getattr(failure.exception, "__notes__", None), f"\n{failure.cause}"
         if isinstance(notes, list):
-            return [str.__str__(note) for note in list.__iter__(notes) if isinstance(note, str)]
+            texts = (str.__str__(note) for note in list.__iter__(notes) if isinstance(note, str))
+            return [text.removesuffix(cause) for text in texts]
     return []
 
 

@@ -24,6 +24,7 @@ SCREENSHOTS = ROOT / "test-output" / "screenshots"
 # The files of the dark group; all others are light. Both groups take about as long: measure with --durations=0.
 DARK = frozenset(
     {
+        "test_kernel_end.py",
         "test_panel.py",
         "test_remote_panel.py",
         "test_search.py",

@@ -76,7 +76,7 @@ def test_every_test_image_says_whether_it_passes_and_why_not(notebook: Notebook,
 def test_verdicts_stay_while_the_hand_drags_and_follow_when_it_lets_go(panel: PanelOnScreen) -> None:
     with panel.restless():
         x, y = panel.grab("threshold")
-        panel.page.mouse.move(x + 10, y, steps=5)
+        panel.page.mouse.move(x + 26, y, steps=5)  # a slider has the width of its column
         panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).threshold > 115")
         assert panel.page.evaluate(STATES) == ["passed", "failed", "failed"]
         panel.page.mouse.up()

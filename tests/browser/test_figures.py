@@ -26,6 +26,8 @@ from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
 
 pytestmark = pytest.mark.browser
 
+KEPT_NOTE = "a smaller picture was kept: run the cell again"
+
 _THEMES = Path(sys.prefix) / "share" / "jupyter" / "lab" / "themes" / "@jupyterlab"
 _CODE = {
     "light": ("#000000", "#ffffff", "#006ab1", "#a1260d", "#bf8803"),
@@ -124,22 +126,41 @@ def edges(photo: np.ndarray) -> str:
 # -- cards ------------------------------------------------------------------------------------------------------------
 
 
-def test_hovering_a_token_shows_its_thumbnail_larger_with_what_is_known_of_it(sheet: Sheet, edges: str) -> None:
+SHOWN_SHARP = """where => {
+    const image = document.querySelector(where + ' img');
+    return image?.complete && image.naturalWidth >= image.clientWidth * devicePixelRatio ? image.naturalWidth : 0;
+}"""
+
+
+def test_hovering_a_token_shows_its_kept_picture_with_what_is_known_of_it(sheet: Sheet, edges: str) -> None:
     sheet.put(edges)
-    small = sheet.page.locator("#token-edges image").bounding_box()
     sheet.page.hover("#token-edges")
     assert sheet.card[:3] == ["token edges", "uint8 400 x 600", "0 to 255"]
     assert sheet.card[3].startswith("mean ")
-    assert sheet.card[-1] == "fresh"
-    large = sheet.page.locator(".epypes-card image").bounding_box()
-    assert large["width"] == pytest.approx(3 * small["width"], rel=0.05)
-    rendering = "img => getComputedStyle(img).imageRendering"
-    assert sheet.page.locator(".epypes-card image").evaluate(rendering) == "pixelated", "a mask keeps its edges"
+    assert sheet.card[-2:] == ["fresh", KEPT_NOTE]
+    assert sheet.page.wait_for_function(SHOWN_SHARP, arg=".epypes-card").json_value() == 600
     sheet.page.hover("#token-image")
     assert sheet.card[0] == "token image"
-    assert sheet.page.locator(".epypes-card image").evaluate(rendering) == "auto"
+    assert sheet.page.wait_for_function(SHOWN_SHARP, arg=".epypes-card").json_value() == 512
     pictures = re.findall(r"base64,([A-Za-z0-9+/=]+)", edges)
-    assert len(pictures) == len(set(pictures)) == 4, "no picture is carried twice"
+    assert len(pictures) == len(set(pictures)) == 8, "no picture is carried twice"
+
+
+def test_a_mask_that_is_enlarged_keeps_its_edges(sheet: Sheet) -> None:
+    cg = ep.CompGraph({"f": lambda image: image > 127}, {"f": ("image", "mask")})
+    run = ep.CompGraphRunner(cg).run(image=np.tile(np.arange(256, dtype=np.uint8), (200, 1)))
+    sheet.put(mimebundle(run)["text/html"], style=".epypes-card img{width:500px}")
+    for token, rendering in (("mask", "pixelated"), ("image", "auto")):
+        sheet.page.hover(f"#token-{token}")
+        is_drawn = "how => getComputedStyle(document.querySelector('.epypes-card img')).imageRendering === how"
+        sheet.page.wait_for_function(is_drawn, arg=rendering)
+
+
+def test_a_token_whose_picture_was_not_kept_shows_its_thumbnail_in_its_own_size(sheet: Sheet, edges: str) -> None:
+    sheet.put(re.sub(r'<details class="epypes-kept".*?</details>', "", edges))
+    sheet.page.hover("#token-image")
+    assert sheet.page.wait_for_function(SHOWN_SHARP, arg=".epypes-card").json_value() == 128
+    assert sheet.card[-1] == "no larger picture was kept: run the cell again"
 
 
 def test_the_card_goes_with_the_pointer_and_with_escape(sheet: Sheet, edges: str) -> None:
@@ -240,25 +261,194 @@ def test_a_function_whose_source_did_not_fit_says_so(sheet: Sheet) -> None:
     assert "source left out to keep the picture small" in sheet.about
 
 
-def test_a_panel_that_would_stand_out_of_sight_stands_at_the_edge_of_the_window(sheet: Sheet, edges: str) -> None:
-    sheet.put(edges + "<div style='height:5000px'></div>")
-    window = {"width": 900, "height": 300}
-    sheet.page.set_viewport_size(window)
-    sheet.page.click("#function-grayscale")
-    panel = sheet.page.locator(".epypes-about")
-    panel.wait_for(state="visible")
-    box = panel.bounding_box()
-    assert box["y"] + box["height"] <= window["height"]
-    assert "cvtColor" in sheet.about
-    sheet.page.evaluate("scrollTo(0, 4000)")
-    panel.wait_for(state="hidden")
-    sheet.page.evaluate("scrollTo(0, 0)")
-    panel.wait_for(state="visible")
+LATER = "<div id='later' style='height:5000px'>a later cell</div>"
+
+
+@pytest.mark.parametrize(("width", "is_beside"), [(1200, True), (700, False)])
+def test_what_is_told_stands_beside_the_graph_or_below_it_and_over_nothing(
+    sheet: Sheet, edges: str, width: int, is_beside: bool
+) -> None:
+    sheet.page.set_viewport_size({"width": width, "height": 800})
+    sheet.put(edges + LATER)
+    view, about, later = (sheet.page.locator(each) for each in (".epypes-view", ".epypes-about", "#later"))
+    for vertex in ("#token-image", "#function-blur", "#token-edges"):
+        sheet.page.click(vertex)
+        assert not sheet.has_card, "it would lie over the panel"
+        graph, told, below = (each.bounding_box() for each in (view, about, later))
+        assert told["y"] + told["height"] <= below["y"]
+        assert graph["y"] + graph["height"] <= below["y"]
+        if is_beside:
+            assert told["x"] >= graph["x"] + graph["width"]
+        else:
+            assert told["y"] >= graph["y"] + graph["height"]
+        assert told["y"] + told["height"] <= 800, "it can be seen"
+        hit = "box => document.elementFromPoint(box.x + 9, Math.min(box.y + 9, innerHeight - 1))?.id"
+        assert sheet.page.evaluate(hit, later.bounding_box()) in ("later", "")
     sheet.page.keyboard.press("Escape")
-    panel.wait_for(state="hidden")
-    sheet.page.set_viewport_size({"width": 900, "height": 3000})
-    sheet.page.click("#function-grayscale")
-    assert panel.bounding_box()["y"] > sheet.page.locator("figure svg").first.bounding_box()["height"], "below it"
+    about.wait_for(state="hidden")
+
+
+def test_choosing_an_image_shows_its_picture_in_the_panel(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.click("#token-edges")
+    assert KEPT_NOTE in sheet.about
+    assert sheet.page.wait_for_function(SHOWN_SHARP, arg=".epypes-about").json_value() == 600
+
+
+def test_what_the_click_moves_under_a_resting_pointer_is_not_looked_at(sheet: Sheet, edges: str) -> None:
+    sheet.page.set_viewport_size({"width": 700, "height": 500})
+    sheet.put(edges + LATER)
+    sheet.page.click("#token-image")
+    sheet.page.wait_for_function("scrollY > 0")
+    sheet.page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert not sheet.has_card
+
+
+# -- zoom ---------------------------------------------------------------------------------------------------------------
+
+
+def stereo_like(count: int = 9) -> str:
+    """A graph of two branches of so many functions each, with images, and one where they meet."""
+    io = {}
+    for side in ("left", "right"):
+        for index in range(count):
+            names = (f"{side}_{index}", f"a_{side}_{index}", f"b_{side}_{index}")
+            io[f"smooth_{side}_{index}"] = (names, f"{side}_{index + 1}")
+    io["meet"] = ((f"left_{count}", f"right_{count}", "gain", "offset", "power"), "out")
+    cg = ep.CompGraph(dict.fromkeys(io, lambda image, *others: image + np.uint8(1)), io)
+    values = {name: 1 for name in cg.source_tokens if name not in ("left_0", "right_0")}
+    photo = data.camera()
+    return mimebundle(ep.CompGraphRunner(cg, values).run(left_0=photo, right_0=photo))["text/html"]
+
+
+@pytest.fixture(scope="module")
+def wide() -> str:
+    return stereo_like()
+
+
+def scale_of(sheet: Sheet) -> float:
+    return float(
+        sheet.page.locator("figure svg.epypes-graph").first.evaluate(
+            "svg => svg.getBoundingClientRect().width / svg.viewBox.baseVal.width"
+        )
+    )
+
+
+def overflow(sheet: Sheet) -> list[float]:
+    sizes = "view => [view.scrollWidth - view.clientWidth, view.scrollHeight - view.clientHeight]"
+    return list(sheet.page.locator(".epypes-view").first.evaluate(sizes))
+
+
+def test_a_graph_of_19_functions_is_readable_in_the_output_of_a_window_of_1440(sheet: Sheet, wide: str) -> None:
+    # That is what JupyterLab leaves to an output beside its file browser.
+    sheet.page.set_viewport_size({"width": 1010, "height": 900})
+    sheet.put(wide)
+    sizes = sheet.page.locator("figure text.name").evaluate_all(
+        "all => all.map(each => each.getBoundingClientRect().height)"
+    )
+    assert len(sizes) > 50
+    assert min(sizes) >= 9
+    assert overflow(sheet)[0] <= 0, "it is as wide as the output"
+    assert sheet.page.locator(".epypes-view").bounding_box()["height"] <= 0.8 * 900
+
+
+def test_fit_shows_the_whole_graph_and_the_scale_what_can_be_read(sheet: Sheet, wide: str) -> None:
+    sheet.put(wide)
+    before = scale_of(sheet)
+    assert before >= 0.75
+    sheet.page.click("text=Fit")
+    assert scale_of(sheet) < 0.6
+    assert max(overflow(sheet)) <= 0
+    sheet.page.set_viewport_size({"width": 500, "height": 800})
+    sheet.page.wait_for_function("document.querySelector('figure svg').clientWidth < 500")
+    assert max(overflow(sheet)) <= 0, "also in a window of another size"
+    sheet.page.set_viewport_size({"width": 1200, "height": 800})
+    sheet.page.click(".epypes-bar button >> nth=1")
+    sheet.page.wait_for_function(
+        f"document.querySelector('.epypes-bar button:nth-child(2)').textContent === '{before:.0%}'"
+    )
+
+
+def test_zoom_by_buttons_and_by_the_wheel_keeps_what_is_under_the_pointer(sheet: Sheet, wide: str) -> None:
+    sheet.put(wide)
+    before = scale_of(sheet)
+    sheet.page.click("text=+")
+    assert scale_of(sheet) == pytest.approx(1.25 * before)
+    sheet.page.click(".epypes-bar button >> nth=0")
+    assert scale_of(sheet) == pytest.approx(before)
+    sheet.page.locator("#token-left_1").hover(position={"x": 5, "y": 5})
+    vertex = sheet.page.locator("#token-left_1")
+    was = vertex.bounding_box()
+    sheet.page.keyboard.down("Control")
+    sheet.page.mouse.wheel(0, -200)
+    sheet.page.keyboard.up("Control")
+    sheet.page.wait_for_function(
+        f"document.querySelector('#token-left_1').getBoundingClientRect().width > {1.2 * was['width']}"
+    )
+    now = vertex.bounding_box()
+    assert (now["x"], now["y"]) == pytest.approx((was["x"], was["y"]), abs=12)
+    scrolled = sheet.page.evaluate("scrollY")
+    sheet.page.mouse.wheel(0, 100)
+    sheet.page.wait_for_function("document.querySelector('.epypes-view').scrollTop > 0")
+    assert sheet.page.evaluate("scrollY") == scrolled, "the wheel alone scrolls"
+
+
+def test_a_graph_that_is_cut_is_dragged_and_a_drag_chooses_nothing(sheet: Sheet, wide: str) -> None:
+    sheet.put(wide)
+    sheet.page.click("text=+")
+    sheet.page.click("text=+")
+    assert min(overflow(sheet)) > 100
+    box = sheet.page.locator(".epypes-view").bounding_box()
+    at = box["x"] + 0.6 * box["width"], box["y"] + 0.6 * box["height"]
+    scrolled = "view => [view.scrollLeft, view.scrollTop]"
+    before = sheet.page.locator(".epypes-view").evaluate(scrolled)
+    sheet.page.mouse.move(*at)
+    sheet.page.mouse.down()
+    sheet.page.mouse.move(at[0] - 60, at[1] - 90, steps=4)
+    sheet.page.mouse.up()
+    now = sheet.page.locator(".epypes-view").evaluate(scrolled)
+    assert [now[0] - before[0], now[1] - before[1]] == pytest.approx([60, 90], abs=2)
+    assert sheet.vertices("chosen") == set()
+    sheet.page.mouse.move(at[0], at[1], steps=3)
+    assert sheet.page.locator(".epypes-view").evaluate(scrolled) == now, "the button is up"
+    assert sheet.page.locator("#token-left_3").count()
+    sheet.page.locator("#token-left_3").click()
+    assert sheet.vertices("chosen") == {"left_3"}
+
+
+def test_the_scroll_bar_of_a_graph_can_be_seen(sheet: Sheet, wide: str) -> None:
+    sheet.put(wide)
+    style = "view => getComputedStyle(view, '::-webkit-scrollbar-thumb').backgroundColor"
+    thumb = sheet.page.locator(".epypes-view").evaluate(style)
+    ground = sheet.page.locator(".epypes-view").evaluate(style.replace("thumb", "track"))
+    assert thumb != ground
+    assert sheet.page.locator("figure.cut").count() == 1
+
+
+def test_a_small_graph_stays_as_it_is(sheet: Sheet) -> None:
+    sheet.put(mimebundle(edge_runner().cg)["text/html"])
+    assert scale_of(sheet) == 1
+    assert max(overflow(sheet)) <= 0
+    assert not sheet.page.get_by_text("Fit").is_visible()
+    sheet.page.hover("#function-blur")
+    assert sheet.page.get_by_text("Fit").is_visible()
+
+
+# -- without a script ---------------------------------------------------------------------------------------------------
+
+
+def test_a_page_without_scripts_opens_the_kept_pictures(sheet: Sheet, edges: str) -> None:
+    sheet.put(re.sub(r"(?s)<(script|style)\b.*?</\1>", "", edges))
+    pictures = sheet.page.locator("details.epypes-kept img")
+    assert not pictures.first.is_visible()
+    sheet.page.click("summary")
+    assert pictures.count() == 4
+    assert pictures.first.is_visible()
+    assert sheet.page.locator("details.epypes-kept figcaption").all_inner_texts() == [
+        "edges", "image", "image_gray", "image_blurred",
+    ]  # fmt: skip
+    sheet.put(edges)
+    assert not sheet.page.locator("summary").is_visible(), "where scripts run they are shown at their tokens"
 
 
 def test_a_still_picture_says_how_it_comes_alive(sheet: Sheet, edges: str) -> None:
@@ -277,6 +467,7 @@ def test_choosing_a_group_opens_what_is_inside_it(sheet: Sheet) -> None:
     sheet.page.click(".group >> nth=0")
     opened = sheet.page.locator("details[open]").evaluate_all("all => all.map(each => each.dataset.group)")
     assert opened == ["before <it>"]
+    assert not sheet.has_card, "of what came under the pointer"
     inside = sheet.page.locator("details[open] svg.epypes-graph")
     inside.locator("#function-blur").click()
     assert "GaussianBlur" in sheet.page.locator("details[open] .epypes-about").inner_text()
@@ -370,7 +561,7 @@ def test_a_picture_that_is_taken_away_and_put_back_shows_its_card_again(sheet: S
 
 
 def test_the_card_follows_its_vertex_when_the_page_scrolls(sheet: Sheet, edges: str) -> None:
-    sheet.put(edges)
+    sheet.put(edges + LATER)
     sheet.page.keyboard.press("Tab")
     sheet.page.keyboard.press("Tab")
     beside = """() => {
@@ -493,7 +684,7 @@ def test_every_text_is_readable_on_every_page(sheet: Sheet, states: str, kind: s
     sheet.put(states, style=PAGES[kind])
     assert len(readings(sheet.page, ".output")) > 200
     assert unreadable(sheet.page, ".output") == []
-    for figure in sheet.page.locator("figure").all():
+    for figure in sheet.page.locator(".epypes-figure").all():
         figure.locator(".function").first.click()
     assert sheet.page.locator(".epypes-about pre").count() >= 8, "with panels open and all else dimmed"
     sheet.page.locator(".token").first.hover()

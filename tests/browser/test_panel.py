@@ -302,7 +302,7 @@ def test_promote_tells_whether_the_bundle_computes_the_same(
 ) -> None:
     panel.page.locator(".epypes-promote").click()
     panel.wait("() => document.querySelector('.epypes-foot').textContent.includes('identical')")
-    assert (lab.root / "services" / "above" / "pipeline.py").is_file()
+    assert (lab.root / "services" / "outlines" / "pipeline.py").is_file()
 
 
 def test_at_600_px_everything_is_there_and_nothing_jumps(panel: PanelOnScreen) -> None:

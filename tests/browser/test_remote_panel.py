@@ -110,7 +110,7 @@ def line(state: Any, photograph: Any) -> Iterator[Line]:
 @pytest.fixture(scope="module")
 def open_notebook(lab_page: Any, lab: JupyterLab, state: Any, line: Line) -> Iterator[Notebook]:
     line.answer_of(0)
-    token = Path(state.token_file).read_text().strip()
+    token = Path(state.access_key_file).read_text().strip()
     cells = (
         f"import epypes as ep\nfrom epypes_widgets import tune\nservice = ep.connect('{state.http}', token='{token}')",
         "panel = tune(service)\npanel",
@@ -131,7 +131,7 @@ def panel(open_notebook: Notebook) -> PanelOnScreen:
 
 def test_a_drag_changes_what_the_service_answers(panel: PanelOnScreen, line: Line, state: Any) -> None:
     start = panel.values["canny_lo"]
-    service = ep.connect(state.http, token=Path(state.token_file).read_text().strip())
+    service = ep.connect(state.http, token=Path(state.access_key_file).read_text().strip())
     before = service.parameters().revision
     x, y = panel.grab("canny_lo")
     for step in range(1, 6):
@@ -159,7 +159,7 @@ def test_the_picture_follows_the_line(panel: PanelOnScreen, line: Line) -> None:
 
 
 def test_what_somebody_else_sets_moves_the_control(panel: PanelOnScreen, state: Any) -> None:
-    with ep.connect(state.http, token=Path(state.token_file).read_text().strip()) as service:
+    with ep.connect(state.http, token=Path(state.access_key_file).read_text().strip()) as service:
         service.set(canny_hi=150)
     panel.wait_for("canny_hi", 150)
     panel.wait("() => true")
@@ -183,7 +183,7 @@ def test_a_panel_of_a_service_can_be_looked_at(open_notebook: Notebook, panel: P
 
 def test_what_would_be_written_back_is_shown_first(panel: PanelOnScreen, state: Any, bundle: Path) -> None:
     before = (bundle / "pipeline.toml").read_text()
-    with ep.connect(state.http, token=Path(state.token_file).read_text().strip()) as service:
+    with ep.connect(state.http, token=Path(state.access_key_file).read_text().strip()) as service:
         service.set(canny_lo=41)
     panel.page.locator(".epypes-write-back").click()
     panel.wait("() => document.querySelector('.epypes-diff').textContent.includes('+value')")
@@ -194,7 +194,7 @@ def test_what_would_be_written_back_is_shown_first(panel: PanelOnScreen, state: 
 
 
 def test_a_service_that_ends_leaves_its_last_picture(panel: PanelOnScreen, state: Any) -> None:
-    with ep.connect(state.http, token=Path(state.token_file).read_text().strip()) as service:
+    with ep.connect(state.http, token=Path(state.access_key_file).read_text().strip()) as service:
         service.pause()
         panel.wait_for_status("paused")
         service.resume()

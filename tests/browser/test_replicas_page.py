@@ -27,8 +27,8 @@ def replicas(tmp_path_factory):
             first = Service(bundle, line.sub, line.pub, replica="1")
             second = Service(bundle, line.sub, line.pub, replica="2")
             with (
-                HttpServer(first, "127.0.0.1:*", token_file=folder / "first") as at_first,
-                HttpServer(second, "127.0.0.1:*", token_file=folder / "second") as at_second,
+                HttpServer(first, "127.0.0.1:*", access_key_file=folder / "first") as at_first,
+                HttpServer(second, "127.0.0.1:*", access_key_file=folder / "second") as at_second,
             ):
                 first.http, second.http = at_first.url, at_second.url
                 with first:

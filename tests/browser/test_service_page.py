@@ -104,7 +104,10 @@ def home(tmp_path_factory):
 @pytest.fixture(scope="module")
 def served(bundle, photograph, home):
     with Service(bundle) as service, HttpServer(service, "127.0.0.1:*") as http, peer_of(service) as peer:
-        http.token, http.failures = http.token_file.read_text().strip(), service.info()["addresses"]["failures"]
+        http.access_key, http.failures = (
+            http.access_key_file.read_text().strip(),
+            service.info()["addresses"]["failures"],
+        )
         with Line(service, peer, photograph) as line:
             yield service, http, line
 
@@ -115,13 +118,13 @@ def _is_complaint(message):
 
 
 @contextmanager
-def page_of(browser, http, width=1400, token=True):
+def page_of(browser, http, width=1400, access_key=True):
     """Open the page; whatever it complains of is a failure of the test."""
     page = open_page(browser, viewport={"width": width, "height": 1000})
     said = []
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("console", lambda message: said.append(message.text) if _is_complaint(message) else None)
-    page.goto(f"{http.url}/#token={http.token}" if token else http.url)
+    page.goto(f"{http.url}/?access_key={http.access_key}" if access_key else http.url)
     page.wait_for_selector("#graph svg")
     page.complaints = said
     yield page
@@ -130,7 +133,7 @@ def page_of(browser, http, width=1400, token=True):
 
 def change(http, **values):
     """Change parameters as somebody else."""
-    headers = {"Authorization": f"Bearer {http.token}"}
+    headers = {"Authorization": f"Bearer {http.access_key}"}
     answer = httpx.patch(f"{http.url}/v1/parameters", json={"values": values}, headers=headers, trust_env=False)
     assert answer.status_code == 200, answer.text
 
@@ -149,7 +152,7 @@ def test_the_page_shows_the_running_service(browser, served):
         assert page.locator("#graph [id^=token-]").count() == 7
         assert page.locator("#graph image").count() >= 4
         assert page.locator("#counts dd").first.text_content() != "0"
-        assert "token=" not in page.url
+        assert "access_key" not in page.url
         assert http.failures in page.locator("#facts").text_content()
         for scheme in schemes(page):
             assert not unreadable(page, "body"), scheme
@@ -248,7 +251,7 @@ def test_a_number_that_is_whole_and_may_have_a_fraction_is_given_one(browser, bu
     (folder / "pipeline.toml").write_text(text)
     write_manifest(folder)
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
-        http.token = http.token_file.read_text().strip()
+        http.access_key = http.access_key_file.read_text().strip()
         with page_of(browser, http) as page:
             page.wait_for_function("() => document.getElementById('graph-note').textContent.startsWith('Waiting for')")
             address = service.info()["addresses"]["sub"]
@@ -276,7 +279,7 @@ def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served
         page.wait_for_selector("#parameters-note:not([hidden])")
         page.unroute("**/v1/parameters")
         said = page.locator("#parameters-note").text_content()
-        assert "Somebody else" in said
+        assert "Another client" in said
         assert "canny_lo: 70 → 33; canny_hi: 200 → 150" in said
         assert service.parameters().entries["canny_lo"]["value"] == 33
         assert page.locator("#parameter-canny_lo").input_value() == "90"
@@ -311,18 +314,18 @@ def test_a_failure_is_listed_with_what_opens_it_again(browser, served):
         assert page.evaluate("() => navigator.clipboard.readText()") == f"epypes replay {name} {http.url}"
 
 
-def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_paused(browser, served):
+def test_without_the_access_key_nothing_can_be_changed_and_with_it_the_service_is_paused(browser, served):
     service, http, _ = served
-    with page_of(browser, http, token=False) as page:
+    with page_of(browser, http, access_key=False) as page:
         state_is(page, "READY")
         assert page.locator("#pause").is_disabled()
-        page.locator("#token").fill("x" * 43)
-        page.locator("#token-form button").click()
+        page.locator("#access-key").fill("x" * 43)
+        page.locator("#access-key-form button").click()
         page.wait_for_selector("#notice:not([hidden])")
-        assert "not the service's access token" in page.locator("#notice").text_content()
+        assert "not the service's access key" in page.locator("#notice").text_content()
         assert page.locator("#pause").is_disabled()
-        page.locator("#token").fill(http.token)
-        page.locator("#token-form button").click()
+        page.locator("#access-key").fill(http.access_key)
+        page.locator("#access-key-form button").click()
         page.locator("#pause").click()
         state_is(page, "PAUSED")
         assert service.state == "PAUSED"
@@ -330,10 +333,51 @@ def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_pau
         state_is(page, "READY")
 
 
+@pytest.mark.parametrize("link", ["?access_key={}", "#token={}", "?access_key={}&other=1#part"])
+def test_the_key_of_the_link_is_kept_in_the_tab_and_in_no_address(browser, served, link):
+    _, http, _ = served
+    with page_of(browser, http, access_key=False) as page:
+        requested = []
+        page.on("request", lambda request: requested.append(request.url))
+        page.goto("about:blank")
+        page.goto(f"{http.url}/{link.format(http.access_key)}")
+        page.wait_for_function("() => document.getElementById('access-key-hint').textContent.includes('is right')")
+        assert http.access_key not in page.url
+        assert http.access_key not in page.evaluate("() => location.href + JSON.stringify(history.state)")
+        assert [url for url in requested if http.access_key in url][1:] == []
+        page.reload()
+        page.wait_for_selector("#pause:enabled")
+        page.locator("#access-key-form button").click()
+        page.wait_for_selector("#pause:disabled")
+        assert not page.complaints
+
+
+def test_a_button_that_can_not_be_used_says_why_beside_it(browser, served):
+    _, http, _ = served
+    operation, parameters = "#operation-why", "#parameters-why"
+    with page_of(browser, http, access_key=False) as page:
+        state_is(page, "READY")
+        assert page.locator(operation).text_content() == "These need the access key."
+        page.wait_for_selector("#parameter-canny_lo")
+        nothing = "Apply and Undo: nothing is changed here."
+        assert page.locator(parameters).text_content() == f"{nothing} Write back needs the access key."
+        page.locator("#parameter-canny_lo").fill("91")
+        assert page.locator(parameters).text_content() == "Apply and Write back need the access key."
+        for scheme in schemes(page):
+            assert not unreadable(page, "body"), scheme
+    with page_of(browser, http) as page:
+        page.wait_for_selector("#pause:enabled")
+        assert page.locator(operation).text_content() == "Resume: not while READY."
+        page.wait_for_selector("#parameter-canny_lo")
+        assert page.locator(parameters).text_content() == nothing
+        page.locator("#parameter-canny_lo").fill("91")
+        assert page.locator(parameters).text_content() == "Write back: apply or undo the changes first."
+
+
 def test_values_are_written_back_after_their_difference_was_seen(browser, bundle, photograph, home, tmp_path):
     folder = shutil.copytree(bundle, tmp_path / "edges")
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
-        http.token = http.token_file.read_text().strip()
+        http.access_key = http.access_key_file.read_text().strip()
         change(http, canny_lo=64)
         with page_of(browser, http) as page:
             page.locator("#write-back:enabled").click()

@@ -132,10 +132,87 @@ def test_nothing_moves_and_nothing_sticks_out_when_frames_and_failures_come_and_
     assert view.js(measured) == before
 
 
-def test_on_a_narrow_page_the_controls_stand_right_below_the_picture(view: ViewPage) -> None:
-    view.open(width=600)
-    assert view.box(".epypes-box")["y"] < view.box(".epypes-controls")["y"] < view.box(".epypes-history")["y"]
-    assert view.box(".epypes-box")["width"] > 550
+@pytest.mark.parametrize("width", [600, 880])
+def test_on_a_narrow_page_the_folders_stand_above_the_picture_and_leave_room_for_it(view: ViewPage, width: int) -> None:
+    view.open(width=width, height=900)
+    column, box = view.box(".epypes-controls"), view.box(".epypes-box")
+    assert column["y"] + column["height"] < box["y"] < view.box(".epypes-foot")["y"] < view.box(".epypes-history")["y"]
+    assert column["height"] < 0.4 * 900
+    assert box["width"] > width - 50
+    assert view.js("Math.min(...[...document.querySelectorAll('.slider-container')].map(e => e.offsetWidth))") > 120
+
+
+def test_at_1440_x_900_the_picture_and_what_keeps_it_are_on_the_screen_together(view: ViewPage) -> None:
+    view.open(width=1290, height=900)  # what JupyterLab leaves of 1440
+    promote = view.box(".epypes-promote")
+    top = view.box(".epypes-bar")["y"]
+    assert view.box(".epypes-controls")["x"] + 300 < view.box(".epypes-box")["x"]
+    assert promote["y"] + promote["height"] - top < 740
+    assert view.box(".epypes-box")["height"] > 430
+
+
+def test_the_picture_is_made_higher_by_its_handle_and_stays_so(view: ViewPage) -> None:
+    usual = view.box(".epypes-box")["height"]
+    x, y = view.middle(".epypes-resize")
+    view.drag((x, y), (x, y + 90))
+    assert view.box(".epypes-box")["height"] == usual + 90
+    view.focus(".epypes-resize")
+    view.press("ArrowUp")
+    assert view.box(".epypes-box")["height"] == usual + 70
+    view.open()
+    assert view.box(".epypes-box")["height"] == usual + 70
+    view.page.dblclick(".epypes-resize")
+    assert view.box(".epypes-box")["height"] == usual
+
+
+def test_the_picture_has_the_full_width_and_gives_it_back(view: ViewPage) -> None:
+    before = view.box(".epypes-box")["width"]
+    view.click(".epypes-full-width")
+    assert view.box(".epypes-box")["width"] > before + 300
+    assert view.box(".epypes-controls")["y"] < view.box(".epypes-box")["y"]
+    assert view.attribute(".epypes-full-width", "aria-pressed") == "true"
+    view.click(".epypes-full-width")
+    assert view.box(".epypes-box")["width"] == before
+
+
+def test_names_are_whole_and_two_handles_have_both(view: ViewPage) -> None:
+    rows = view.js("[...document.querySelectorAll('.epypes-label')].map(each => each.textContent)")
+    assert rows == ["blur_kernel", "sigma", "canny_lo", "canny_hi"]
+    cut = "[...document.querySelectorAll('.epypes-label')].filter(each => each.scrollWidth > each.clientWidth).length"
+    assert view.js(cut) == 0
+    assert view.js("document.querySelectorAll('.epypes-label wbr').length") >= 4
+    assert "canny_lo, canny_hi" in (view.attribute(".epypes-row-4", "title") or "")
+
+
+def test_a_box_is_as_wide_as_its_number(view: ViewPage) -> None:
+    view.page.fill("input[data-name=sigma]", "2.12345678901")
+    view.press("Enter")
+    view.settle()
+    assert view.js("document.querySelector('input[data-name=sigma]').value") == "2.12345678901"
+    assert view.js("(e => e.scrollWidth <= e.clientWidth)(document.querySelector('input[data-name=sigma]'))")
+
+
+def test_a_failing_row_without_a_box_can_be_reset(view: ViewPage) -> None:
+    assert view.page.locator(".epypes-row-3 .epypes-reset").is_disabled()
+    view.do(
+        "kernel.deliver({ kind: 'error', seq: kernel.seq + 1, text: 'no such border', function: 'blur', names: ['border'] })"
+    )
+    view.until("!document.querySelector('.epypes-row-3 .epypes-reset').disabled")
+    view.click(".epypes-row-3 .epypes-reset")
+    assert view.sent("reset")[-1]["names"] == ["border"]
+
+
+def test_a_long_message_is_whole_and_moves_nothing(view: ViewPage) -> None:
+    before = view.box(".epypes-foot")["y"]
+    view.do("kernel.deliver({ kind: 'note', text: 'A long sentence. '.repeat(60) })")
+    view.until("document.querySelector('.epypes-status').textContent.length > 900")
+    assert view.box(".epypes-status")["height"] > 60
+    assert view.box(".epypes-foot")["y"] == before
+    view.do("kernel.deliver({ kind: 'settings', names: [], text: 'Much is wrong with it. '.repeat(30), ok: false })")
+    view.until("document.querySelector('.epypes-outcome').textContent.length > 600")
+    assert view.js(
+        "(e => e.scrollWidth <= e.clientWidth && e.scrollHeight <= e.clientHeight)(document.querySelector('.epypes-outcome'))"
+    )
 
 
 def test_where_nothing_was_found_a_text_takes_the_place_of_the_picture_and_the_stage_has_a_sign(view: ViewPage) -> None:
@@ -395,7 +472,13 @@ def test_an_even_number_becomes_the_next_odd_one(view: ViewPage) -> None:
 
 
 @pytest.mark.parametrize(
-    ("typed", "said"), [("99", "its range is 1 to 31"), ("2.5", "takes whole numbers"), ("", "no number")]
+    ("typed", "said"),
+    [
+        ("99", "its range is 1 to 31"),
+        ("2.5", "takes whole numbers"),
+        ("", "Type a number"),
+        ("abc", "Type a number for blur_kernel, not abc."),
+    ],
 )
 def test_what_can_not_be_taken_is_marked_and_not_sent(view: ViewPage, typed: str, said: str) -> None:
     view.page.fill(KERNEL, typed)
@@ -686,12 +769,12 @@ def test_history_is_gone_back_to_and_undone(view: ViewPage) -> None:
 
 def test_settings_are_saved_and_loaded_by_name(view: ViewPage) -> None:
     view.click(".epypes-save")
-    assert view.text(".epypes-setting-message") == "! Give the settings a name."
+    assert view.text(".epypes-outcome") == "! Give the settings a name."
     view.page.fill(".epypes-setting", "bright")
     view.press("Enter")
-    view.until("document.querySelector('.epypes-setting-message').textContent === 'saved bright.toml'")
+    view.until("document.querySelector('.epypes-outcome').textContent === 'saved bright.toml'")
     view.click(".epypes-load")
-    view.until("document.querySelector('.epypes-setting-message').textContent === '! There are no settings bright.'")
+    view.until("document.querySelector('.epypes-outcome').textContent === '! There are no settings bright.'")
 
 
 def test_promote_tells_its_outcome(view: ViewPage) -> None:
@@ -761,9 +844,9 @@ def test_the_notebooks_shortcuts_are_kept_from_the_views_keys_only(view: ViewPag
 
 
 def test_the_static_picture_is_hidden_while_the_view_lives(view: ViewPage) -> None:
-    assert not view.shown(".epypes-static")
+    assert not view.shown(".epypes-kept")
     view.do("kernel.close()")
-    assert view.shown(".epypes-static")
+    assert view.shown(".epypes-kept")
     assert view.sent("closed") == [{"kind": "closed"}]
 
 

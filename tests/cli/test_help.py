@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import subprocess
 import sys
 
 import click
 import pytest
 
+import epypes as ep
 from epypes.cli.app import app
 from epypes.errors import AddressError
 from epypes.transport.address import parse_address
 
 COMMANDS = [[name] for name in app.commands] + [["export", name] for name in app.commands["export"].commands]
 # The rooms of EPypes that the command line may import before it knows what to do.
-LIGHT = {"cli", "deprecation", "errors", "optional", "wording"}
+LIGHT = {"cli", "deprecation", "errors", "optional", "tracebacks", "wording"}
 # Besides the standard library.
 LIBRARIES = {"click", "epypes"}
 # Each command has a process of its own, forked from one that has imported what all of them need.
@@ -54,8 +57,11 @@ def test_help_imports_no_library_but_click_and_no_other_room():
 def test_help_has_a_whole_line_for_every_command(epypes, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     said = epypes("--help").stdout
-    lines = {line.split()[0]: line for line in said.partition("Commands:")[2].splitlines() if line.strip()}
+    topics = said.partition("From a notebook to a bundle:")[2].partition("Examples:")[0]
+    lines = {line.split()[0]: line for line in topics.splitlines() if line.startswith("  ")}
     assert lines.keys() == app.commands.keys()
+    columns = {line.index(re.split("  +", line)[2]) for line in lines.values()}
+    assert len(columns) == 1, "the topics are one table"
     assert [line for line in lines.values() if line.rstrip().endswith("...") or len(line.split()) < 3] == []
 
 
@@ -105,4 +111,30 @@ def test_the_help_of_check_documents_the_keys_of_a_case(epypes):
 def test_without_a_command_the_help_is_printed(epypes):
     done = epypes()
     assert done.returncode == 2
-    assert "Commands:" in done.stderr
+    assert "A running service:" in done.stderr
+
+
+@pytest.mark.parametrize("words", [[], *COMMANDS], ids=" ".join)
+def test_every_help_has_an_example_that_its_command_takes(words, epypes):
+    text = epypes(*words, "--help").stdout
+    examples = [line.strip() for line in text.partition("Example")[2].splitlines()[1:]]
+    assert examples
+    assert "<bool>" not in text
+    assert "BOOLEAN" not in text
+    for line in examples:
+        given = shlex.split(line)[1:]
+        assert given[: len(words)] == words
+        found = app
+        while isinstance(found, click.Group):
+            found = found.commands[given.pop(0)]
+        if "-h" not in given:
+            found.make_context("epypes", given)
+
+
+@pytest.mark.parametrize("words", [[], ["serve"], ["export"], ["export", "docker"]], ids=" ".join)
+def test_h_is_help(epypes, words):
+    assert epypes(*words, "-h").stdout == epypes(*words, "--help").stdout
+
+
+def test_version_is_that_of_the_package(epypes):
+    assert epypes("--version").stdout.split() == ["epypes", ep.__version__]

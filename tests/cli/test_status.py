@@ -35,7 +35,7 @@ def replicas(host, **bundles):
             service = held.enter_context(Service(bundle, *where, replica=name, **options))
             if not services:
                 server = held.enter_context(HttpServer(service, "127.0.0.1:0"))
-                service.http, service.token_file = server.url, str(server.token_file)
+                service.http, service.access_key_file = server.url, str(server.access_key_file)
             lock.publish(service.service_state)
             services.append(service)
         until(lambda: all(each.group()["replicas"] == len(services) for each in services))

@@ -355,7 +355,7 @@ def test_a_function_of_250_tokens_is_drawn_within_the_limits(makes, direction):
     runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda *_: tuple(range(count))}, io))
     run = runner.run(**dict.fromkeys(("x",) if makes else names, 1))
     bundle = ep.show(run, direction=direction)._repr_mimebundle_()
-    limit = 20_000 + 600 * (count + 2)
+    limit = 30_000 + 600 * (count + 2)
     assert len(bundle["image/svg+xml"]) <= limit
     assert len(bundle["text/html"]) <= limit
     pieces = re.search(r'class="edge" d="M([^"]*)"', bundle["image/svg+xml"])[1].split("M")
@@ -515,7 +515,7 @@ def test_a_very_large_graph_is_drawn_in_rows_without_a_word(capfd):
     count = 600
     io = {f"f{index}": (f"t{index}", f"t{index + 1}") for index in range(count)}
     cg = ep.CompGraph(dict.fromkeys(io, abs), io)
-    svg = to_svg(cg)
+    svg = ep.show(cg, collapse=False).svg
     assert svg.count("<g ") == len(cg.functions) + len(cg.tokens) == 1201
     assert capfd.readouterr() == ("", "")
 
@@ -527,7 +527,30 @@ def test_a_graph_of_200_functions_is_laid_out_once_whatever_its_values():
         ep.CompGraph(dict.fromkeys(io, lambda x, k: x + k), io), {f"k{index}": 1 for index in range(200)}
     )
     lay_out.cache_clear()
-    mimebundle(runner.run(t0=100_000))
+    mimebundle(ep.show(runner.run(t0=100_000), collapse=False))
     for value in (2, 3, 4):
-        mimebundle(runner.rerun(k100=value))
+        mimebundle(ep.show(runner.rerun(k100=value), collapse=False))
     assert lay_out.cache_info().misses == 1
+
+
+def test_hyperparameters_stand_in_stacks_where_the_graph_would_be_wider_than_a_page():
+    names = {side: tuple(f"a_long_name_{side}_{index}" for index in range(4)) for side in ("left", "right")}
+    io = {side: ((f"image_{side}", *names[side]), f"result_{side}") for side in names}
+    io["meet"] = (("result_left", "result_right"), "result")
+    cg = ep.CompGraph(dict.fromkeys(io, lambda *values: 1), io)
+    runner = ep.CompGraphRunner(cg, dict.fromkeys((*names["left"], *names["right"]), 1))
+    svg = to_svg(runner)
+    at = {name: re.search(rf'id="token-{name}".*?<text [^>]*x="(\d+)" y="(\d+)"', svg) for name in names["left"]}
+    assert float(re.search(r'width="(\d+)"', svg)[1]) < 1_000
+    assert len({found[1] for found in at.values()}) == 1, "one below the other"
+    assert [int(found[2]) for found in at.values()] == sorted(int(found[2]) for found in at.values())
+
+
+def test_data_flows_straight_down_past_hyperparameters():
+    io = {f"f{index}": ((f"t{index}", f"threshold_{index}"), f"t{index + 1}") for index in range(6)}
+    runner = ep.CompGraphRunner(
+        ep.CompGraph(dict.fromkeys(io, lambda *values: 1), io), {f"threshold_{index}": 1 for index in range(6)}
+    )
+    svg = to_svg(runner)
+    middles = {re.search(rf'id="token-t{index}".*?<text [^>]*x="(\d+)"', svg)[1] for index in range(1, 7)}
+    assert len(middles) == 1

@@ -231,7 +231,7 @@ def test_any_message_can_be_shown(message):
     lines = texts(vertices(bundle["image/svg+xml"])["function-fails"])
     assert 3 <= len(lines) <= 5
     assert "<script>alert" not in bundle["text/html"]
-    assert len(bundle["text/html"].encode()) < 20_000 + 7 * 600
+    assert len(bundle["text/html"].encode()) < 30_000 + 7 * 600
 
 
 # -- every state has a word -------------------------------------------------------------------------------------------

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.display import mimebundle, to_svg, view
+from epypes.display import to_svg, view
 from epypes.display.layout import lay_out
-from epypes.display.text import THUMBNAIL_CHARACTERS
+from epypes.display.text import KEPT_CHARACTERS, THUMBNAIL_CHARACTERS
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -33,9 +33,8 @@ def noise(seed: int = 0) -> np.ndarray:
 
 
 def with_thumbnail(run: ep.Run) -> set[str]:
-    return {
-        token.name for token in view(run).tokens if token.preview and (token.preview.picture or token.preview.chart)
-    }
+    tokens = view(run, collapse=False).tokens
+    return {token.name for token in tokens if token.preview and (token.preview.picture or token.preview.chart)}
 
 
 def chain(count: int) -> ep.CompGraph:
@@ -49,13 +48,14 @@ def chain(count: int) -> ep.CompGraph:
 def test_twenty_four_thumbnails_are_shown_and_the_others_keep_their_words():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
     assert with_thumbnail(run) == {"t60", *(f"t{index}" for index in range(23))}
-    assert "37 thumbnails left out" in view(run).caption
-    assert all(token.preview.text == "uint8 200 x 200 x 3 bgr" for token in view(run).tokens)
+    graph = view(run, collapse=False)
+    assert "37 thumbnails left out" in graph.caption
+    assert all(token.preview.text == "uint8 200 x 200 x 3 bgr" for token in graph.tokens)
 
 
 def test_what_has_no_thumbnail_still_tells_its_range():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
-    left_out = next(token.preview for token in view(run).tokens if token.name == "t50")
+    left_out = next(token.preview for token in view(run, collapse=False).tokens if token.name == "t50")
     assert left_out.picture is None
     assert re.match(r"uint8 200 x 200 x 3 bgr, \d+ to \d+ of a sample, mean ", left_out.detail)
 
@@ -63,7 +63,7 @@ def test_what_has_no_thumbnail_still_tells_its_range():
 def test_so_many_can_be_asked_for():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
     for asked, expected in ((0, 0), (3, 3), (1000, 37)):
-        graph = view(run, thumbnails=asked)
+        graph = view(run, thumbnails=asked, collapse=False)
         assert sum(token.preview.picture is not None for token in graph.tokens) == expected
         assert f"; {61 - expected} thumbnails left out" in graph.caption
 
@@ -72,12 +72,13 @@ def test_so_many_can_be_asked_for():
 def test_all_chosen_thumbnails_together_stay_within_their_part_of_the_picture():
     for count in (5, 23, 60):
         run = ep.CompGraphRunner(chain(count)).run(t0=noise())
-        spent = sum(len(data) for data in re.findall(r'href="data:[^"]*"', to_svg(run)))
+        figure = ep.show(run, collapse=False)
+        spent = sum(len(data) for data in re.findall(r'href="data:[^"]*"', figure.svg))
         assert 20_000 < spent <= THUMBNAIL_CHARACTERS
         assert len(with_thumbnail(run)) == min(count + 1, 24)
-        limit = 20_000 + 600 * (2 * count + 1) + THUMBNAIL_CHARACTERS
-        bundle = mimebundle(run)
-        assert max(len(bundle["image/svg+xml"]), len(bundle["text/html"])) <= limit
+        limit = 30_000 + 600 * (2 * count + 1) + THUMBNAIL_CHARACTERS
+        assert len(figure.svg) <= limit
+        assert len(figure.html) <= limit + KEPT_CHARACTERS
 
 
 def test_sinks_come_first_then_source_images_then_what_ran_last():

@@ -69,13 +69,25 @@ def test_a_source_pipeline_has_no_stamps_of_f_in():
     assert stamps["react"] <= stamps["f_out_start"] <= stamps["f_out_end"]
 
 
-def test_a_put_that_raises_is_a_failure_of_f_out():
+def test_a_put_of_ones_own_that_raises_is_no_failure_of_f_out():
     class Broken(ep.FullPipeline):
         def put(self, answer, view):
             raise OSError("no room")
 
     failures = queue.Queue()
     pipe = Broken("p", graph(), queue.Queue(), queue.Queue(), lambda event: {"x": event}, lambda view: view["y"])
+    pipe.on_error = failures.put
+    pipe.handle(1)
+    assert str(failures.get_nowait()) == "put: OSError: no room"
+
+
+def test_a_queue_that_takes_no_answer_is_a_failure_of_f_out():
+    class Full:
+        def put(self, item):
+            raise OSError("no room")
+
+    failures = queue.Queue()
+    pipe = ep.FullPipeline("p", graph(), queue.Queue(), Full(), lambda event: {"x": event}, lambda view: view["y"])
     pipe.on_error = failures.put
     pipe.handle(1)
     assert str(failures.get_nowait()) == "f_out: OSError: no room"

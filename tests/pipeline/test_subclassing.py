@@ -148,7 +148,7 @@ def test_a_sink_pipeline_of_ones_own_handles_and_emits_as_it_likes_and_its_failu
         for event in ("not mine", 4, "no", "x", 5):
             q_in.put(event)
         assert [pipe.kept.get(timeout=TIMEOUT_S) for _ in range(2)] == [(4, 5), (5, 6)]
-    assert [failures.get_nowait().function for _ in range(2)] == ["f_out", "add"]
+    assert [failures.get_nowait().function for _ in range(2)] == ["emit", "add"]
     assert (pipe.failed, pipe.run_count) == (2, 4)
     assert failures.empty()
 
@@ -178,6 +178,95 @@ def test_a_full_pipeline_of_ones_own_has_every_hook_of_those_that_it_is_made_of(
         answers = [q_out.get(timeout=TIMEOUT_S) for _ in range(4)]
     assert answers == [(9, 10, 1), ("again", 1), (18, 20, 2), ("again", 2)]
     assert not pipe.loop.is_running
+
+
+def full(kind=ep.FullPipeline, f_out=lambda view: view["y"]):
+    return kind("full", add_graph(), queue.Queue(), queue.Queue(), lambda event: {"x": event}, f_out, {"n": 1})
+
+
+def test_an_emit_or_a_put_that_is_set_on_the_object_is_called():
+    pipe, emitted = full(), []
+    pipe.emit = lambda event, run: emitted.append((event, run["y"]))
+    pipe.handle(2)
+    assert (emitted, pipe.q_out.empty(), pipe.failed) == ([(2, 3)], True, 0)
+    del pipe.emit
+    pipe.put = lambda answer, view: emitted.append(answer)
+    pipe.handle(3)
+    assert emitted == [(2, 3), 4]
+
+
+class EmitsLate(ep.FullPipeline):
+    """Fails after it has answered."""
+
+    def emit(self, event, run):
+        super().emit(event, run)
+        raise RuntimeError("late")
+
+
+class EmitsEarly(ep.FullPipeline):
+    """Fails before it answers."""
+
+    def emit(self, event, run):
+        raise RuntimeError("early")
+
+
+def fails(view):
+    raise RuntimeError("no answer")
+
+
+class Answers(ep.FullPipeline):
+    def emit(self, event, run):
+        super().emit(event, run)
+
+
+@pytest.mark.parametrize(
+    ("make", "function"),
+    [
+        (lambda: full(EmitsLate), "emit"),
+        (lambda: full(EmitsEarly), "emit"),
+        (lambda: full(Answers, fails), "f_out"),
+        (lambda: full(f_out=fails), "f_out"),
+    ],
+    ids=["after the answer", "before the answer", "f_out of an emit of one's own", "f_out"],
+)
+def test_a_failure_after_the_graph_names_the_hook_or_f_out(make, function):
+    failures, pipe = [], make()
+    pipe.on_error = failures.append
+    pipe.handle(1)
+    assert [failure.function for failure in failures] == [function]
+    (stage, _) = pipe.stages.after
+    assert stage.state == "failed"
+    assert stage.notes[-1].startswith("emit: RuntimeError: " if function == "emit" else "RuntimeError: ")
+
+
+def test_a_source_pipeline_shows_that_f_out_failed_until_the_next_answer():
+    pipe = ep.SourcePipeline("source", add_graph(), queue.Queue(), lambda view: 1 // view["y"], {"n": 1})
+    with pytest.raises(ZeroDivisionError):
+        pipe.run(x=-1)
+    assert (pipe.stages.after[0].state, pipe.stages.after[0].notes[-1][:18]) == ("failed", "ZeroDivisionError:")
+    pipe.run(x=1)
+    assert pipe.stages.after[0].state == "static"
+
+
+@pytest.mark.parametrize("is_heard", [False, True])
+def test_a_handle_of_ones_own_that_raises_is_counted_and_reported(is_heard, caplog):
+    class Refusing(ep.SinkPipeline):
+        def handle(self, event):
+            if event == "no":
+                raise ValueError("not this one")
+            super().handle(event)
+            done.put(event)
+
+    done, failures = queue.Queue(), []
+    pipe = Refusing("sink", add_graph(), queue.Queue(), lambda event: {"x": event}, {"n": 1})
+    pipe.on_error = failures.append if is_heard else None
+    with pipe:
+        for event in ("no", 1):
+            pipe.q_in.put(event)
+        assert done.get(timeout=TIMEOUT_S) == 1
+    assert pipe.failed == 1
+    assert [str(failure) for failure in failures] == ["handle: ValueError: not this one"] * is_heard
+    assert ("an event failed in handle: ValueError: not this one" in caplog.text) != is_heard
 
 
 class Disturbed(ep.FullPipeline):

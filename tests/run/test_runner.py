@@ -104,7 +104,12 @@ def test_only_what_the_targets_need_must_be_given():
     [
         ({"x": 1, "imgae": 2}, UnknownName, "No token 'imgae'"),
         ({"x": 1, "a": 2}, PayloadError, "made by function 'double'"),
-        ({"x": 1, "n": 2}, PayloadError, "is a hyperparameter. Set runner"),
+        (
+            {"x": 1, "n": 2},
+            PayloadError,
+            r"which run\(\) does not take. Change it with rerun\(n=2\), or with runner\['n'\] = 2",
+        ),
+        ({"x": 1, "nn": 2}, UnknownName, r"Did you mean the hyperparameter 'n'\? Change it with rerun\(n=2\)"),
     ],
 )
 def test_payload_that_is_none_is_refused_before_anything_runs(chain, payload, error, words):
@@ -133,25 +138,33 @@ def test_a_function_asked_for_as_a_token_is_told_what_it_makes(edge_runner, phot
         edge_runner.rerun("canny")
 
 
-def test_of_a_misspelt_payload_only_the_graphs_input_is_offered(edge_runner, photograph):
+def test_of_a_misspelt_payload_the_graphs_input_is_offered_or_a_hyperparameter_to_be_set_otherwise(
+    edge_runner, photograph
+):
     with pytest.raises(UnknownName, match="Did you mean 'image'"):
         edge_runner.run(img=photograph)
-    with pytest.raises(UnknownName) as error:
-        edge_runner.run(cany_lo=3)
+    with pytest.raises(
+        UnknownName, match=r"the hyperparameter 'canny_lo'\? Change it with rerun\(canny_lo=3\)"
+    ) as error:
+        edge_runner.run(image=photograph, cany_lo=3)
     assert error.value.known == ("image",)
+    with pytest.raises(UnknownName, match="There are: image.$"):
+        edge_runner.run(picture=photograph)
 
 
 def test_the_note_shows_small_values_and_the_shape_of_arrays(edge_runner, photograph):
     with pytest.raises(cv2.error) as error:
         edge_runner.run(image=None)
-    assert error.value.__notes__ == ["In function 'grayscale': (image=None) -> (image_gray)"]
+    (note,) = error.value.__notes__
+    assert note.partition("\n")[0] == "In function 'grayscale': (image=None) -> (image_gray)"
     edge_runner["blur_kernel"] = 4
     with pytest.raises(cv2.error) as error:
         edge_runner.run(image=photograph)
-    assert error.value.__notes__ == [
-        "In function 'blur': (image_gray: uint8 400 x 600, blur_kernel=4) -> (image_blurred)"
-    ]
-    assert edge_runner.last.failure.message.startswith("(-215:Assertion failed) ksize")
+    (note,) = error.value.__notes__
+    first = "In function 'blur': (image_gray: uint8 400 x 600, blur_kernel=4) -> (image_blurred)"
+    assert note.partition("\n")[0] == first
+    message = edge_runner.last.failure.message.removeprefix(f"{edge_runner.last.failure.cause} ")
+    assert message.startswith("(-215:Assertion failed) ksize")
 
 
 @pytest.mark.parametrize(

@@ -181,7 +181,7 @@ class Standing:
 @contextmanager
 def standing(service, address="127.0.0.1:0"):
     """Serve it over HTTP; yield the server, with its ``url`` and ``token``."""
-    token_file = service.folder / "token"
-    with HttpServer(service, address, token_file=token_file) as server:
-        server.token = token_file.read_text().strip()
+    access_key_file = service.folder / "token"
+    with HttpServer(service, address, access_key_file=access_key_file) as server:
+        server.token = access_key_file.read_text().strip()
         yield server

@@ -99,29 +99,49 @@ def test_a_proxy_of_the_environment_is_passed_by_on_this_machine(server, monkeyp
         assert connection.info()["name"] == "edges"
 
 
-def test_looking_needs_no_token_and_changing_says_where_it_is(service, server):
+def test_looking_needs_no_access_key_and_changing_says_where_it_is(service, server):
     with ep.connect(server.url) as connection:
         assert connection.parameters().revision == 0
-        with pytest.raises(ServiceError, match="ep.connect\\(url, token=...\\), or set EPYPES_TOKEN"):
+        with pytest.raises(ServiceError, match="ep.connect\\(url, access_key=...\\), or set EPYPES_ACCESS_KEY"):
             connection.set(canny_lo=60)
     assert service.revision == 0
 
 
 @pytest.mark.slow
-def test_the_token_is_taken_from_the_address_the_environment_or_the_state_of_the_service(service, server, monkeypatch):
-    with ep.connect(f"{server.url}/#token={server.token}") as connection:
-        assert connection.set(canny_lo=60).revision == 1
-    with monkeypatch.context() as patch, ep.connect(server.url) as connection:
-        patch.setenv("EPYPES_TOKEN", server.token)
-        with ep.connect(server.url) as connection:
-            assert connection.set(canny_lo=61).revision == 2
+def test_the_access_key_is_taken_from_the_address_the_environment_or_the_state_of_the_service(
+    service, server, monkeypatch
+):
+    revision = 0
+    for link in ("?access_key={}", "#token={}"):
+        revision += 1
+        with ep.connect(f"{server.url}/{link.format(server.token)}") as connection:
+            assert connection.url == server.url
+            assert connection.set(canny_lo=60 + revision).revision == revision
+    for name in ("EPYPES_ACCESS_KEY", "EPYPES_TOKEN"):
+        revision += 1
+        with monkeypatch.context() as patch:
+            patch.setenv(name, server.token)
+            with ep.connect(server.url) as connection:
+                assert connection.set(canny_lo=60 + revision).revision == revision
+    for keyword in ("access_key", "token"):
+        revision += 1
+        with ep.connect(server.url, **{keyword: server.token}) as connection:
+            assert connection.set(canny_lo=60 + revision).revision == revision
     from epypes.service.state_file import ServiceState
 
     with StateLock(service.folder) as lock:
-        state = ServiceState(1, "tcp://a", "tcp://b", "d", http=server.url, token_file=str(server.token_file))
+        state = ServiceState(1, "tcp://a", "tcp://b", "d", http=server.url, access_key_file=str(server.access_key_file))
         lock.publish(state)
         with ep.connect(server.url) as connection:
-            assert connection.set(canny_lo=62).revision == 3
+            assert connection.set(canny_lo=82).revision == revision + 1
+
+
+def test_no_error_shows_the_access_key_of_a_link(server):
+    for url in (f"ftp://127.0.0.1/?access_key={'s' * 43}", f"http://127.0.0.1:1/?access_key={'s' * 43}"):
+        with pytest.raises(ServiceError) as raised:
+            ep.connect(url)
+        assert "sss" not in str(raised.value)
+        assert "sss" not in raised.value.path
 
 
 @pytest.mark.slow

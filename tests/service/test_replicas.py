@@ -67,8 +67,8 @@ def trio(acting, tmp_path_factory):
 def http(trio, tmp_path_factory):
     """The control of the first of them."""
     _, (first, *_) = trio
-    with HttpServer(first, "127.0.0.1:*", token_file=tmp_path_factory.mktemp("token") / "token") as server:
-        headers = {"Authorization": f"Bearer {server.token_file.read_text().strip()}"}
+    with HttpServer(first, "127.0.0.1:*", access_key_file=tmp_path_factory.mktemp("token") / "token") as server:
+        headers = {"Authorization": f"Bearer {server.access_key_file.read_text().strip()}"}
         with httpx.Client(base_url=server.url, trust_env=False, timeout=60, headers=headers) as client:
             yield client
 

@@ -414,7 +414,7 @@ def stateful_source_that_dies_at(before):
 def test_a_panel_on_a_service_tries_values_on_the_last_event_with_its_state(adding):
     with serving(adding) as (service, peer), HttpServer(service, "127.0.0.1:0") as server:
         assert sums(peer, 1, 2, 3) == [1, 3, 6]
-        with ep.connect(server.url, token=server.token_file.read_text().strip()) as connection:
+        with ep.connect(server.url, token=server.access_key_file.read_text().strip()) as connection:
             runner = connection.to_tune()
             assert dict(runner.cg.delays) == {"before": ("total", None)}
             assert runner.free_source_tokens == ("what", "number")
@@ -442,7 +442,7 @@ def test_the_commands_show_and_reset_the_state(adding, tenfold, epypes):
         assert "state between events kept." in deployed
         assert epypes("call", tenfold, 'what="plain"', "number=1").stdout.startswith("out = 70")
         assert "events reset." in epypes("rollback", "--http", state.http, "--state", "reset").stdout
-        with ep.connect(state.http, token="wrong") as stranger, pytest.raises(ServiceError, match="token"):
+        with ep.connect(state.http, token="wrong") as stranger, pytest.raises(ServiceError, match="access key"):
             stranger.reset()
         with ep.connect(state.http) as connection:
             assert connection.reset()["states"]["count"] == 0

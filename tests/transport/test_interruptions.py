@@ -64,7 +64,7 @@ def test_a_signal_in_the_midst_of_a_put_leaves_the_publisher_usable():
 
 
 @pytest.mark.parametrize("begun", [1, 4])
-def test_a_message_that_is_interrupted_before_or_between_its_frames_does_not_spoil_the_next(begun):
+def test_a_message_that_is_interrupted_before_or_between_its_frames_does_not_spoil_the_next(begun, caplog):
     out, into = Mailbox(), queue.SimpleQueue()
     payloads = {name: np.zeros((100, 100), np.uint8) for name in "abc"}
 
@@ -91,6 +91,7 @@ def test_a_message_that_is_interrupted_before_or_between_its_frames_does_not_spo
         assert sub.rejected.total() == 1
         assert pub.sent == 2
         assert pub.rejected == {"KeyboardInterrupt": 1}
+        assert "rejected an item" not in caplog.text
 
 
 def test_an_item_that_wants_to_end_the_process_ends_no_bridge_and_is_counted():

@@ -35,22 +35,26 @@ HINTS: dict[str, Any] = {
 }
 
 
-def test_each_control_stands_once_under_the_function_that_takes_it_first(edges: ep.CompGraphRunner) -> None:
+def test_each_control_stands_once_and_what_several_functions_take_under_a_heading_of_its_own(
+    edges: ep.CompGraphRunner,
+) -> None:
     found = listed(edges, **HINTS)
-    assert [(row["names"], row["function"]) for row in found.rows] == [
-        (["ksize"], "blur"),
-        (["border"], "blur"),
-        (["lo", "hi"], "canny"),
+    assert [(row["names"], row["functions"]) for row in found.rows] == [
+        (["border"], ["blur"]),
+        (["ksize"], ["blur", "canny"]),
+        (["lo", "hi"], ["canny"]),
     ]
     assert found.folders == (
-        {"css": "epypes-folder-0", "function": "blur"},
-        {"css": "epypes-folder-1", "function": "canny"},
+        {"css": "epypes-folder-0", "functions": ["blur"]},
+        {"css": "epypes-folder-1", "functions": ["blur", "canny"]},
+        {"css": "epypes-folder-2", "functions": ["canny"]},
     )
+    assert ">shared: blur, canny</span>" in found.widget.children[1].children[1].children[0].value
 
 
 def test_the_page_is_told_the_hard_range_the_steps_and_the_first_values(edges: ep.CompGraphRunner) -> None:
     edges["lo"] = 80
-    size, border, pair = listed(edges, **HINTS).rows
+    border, size, pair = listed(edges, **HINTS).rows
     assert {key: size[key] for key in ("kind", "integer", "odd", "log", "low", "high", "step", "unit")} == {
         "kind": "slider", "integer": True, "odd": True, "log": False, "low": [1], "high": [31], "step": [2], "unit": "px"
     }  # fmt: skip
@@ -62,32 +66,34 @@ def test_the_page_is_told_the_hard_range_the_steps_and_the_first_values(edges: e
 def test_rows_and_folders_are_found_by_their_classes(edges: ep.CompGraphRunner) -> None:
     found = listed(edges, **HINTS)
     assert "epypes-controls" in found.widget._dom_classes
-    search, blur, canny = found.widget.children
+    search, folders = found.widget.children
+    blur, _shared, canny = folders.children
     assert (search._dom_classes, search.placeholder) == (("epypes-filter",), "Filter")
     assert blur._dom_classes == ("epypes-folder", "epypes-folder-0")
-    heading, size, _border = blur.children
+    heading, border = blur.children
     assert heading._dom_classes == ("epypes-heading",)
-    assert size._dom_classes == ("epypes-row", "epypes-row-0")
-    assert size.children[0].model_id == found.rows[0]["model"]
+    assert border._dom_classes == ("epypes-row", "epypes-row-0")
+    assert border.children[0].model_id == found.rows[0]["model"]
     assert canny.children[1].children[0].description == "lo .. hi"
-    assert size.children[0].description == "ksize"
+    assert border.children[0].description == "border"
 
 
 def test_names_with_markup_in_them_stay_names() -> None:
     cg = ep.CompGraph({"<b>f</b>": lambda x: x}, {"<b>f</b>": ("<i>x", "y")})
     (entry,) = controls(ep.CompGraphRunner(cg, {"<i>x": 5}), {})
     found = column(cg, [entry])
-    (_search, folder) = found.widget.children
+    (folder,) = found.widget.children[1].children
     assert folder.children[0].value.startswith('<span class="epypes-name">&lt;b&gt;f&lt;/b&gt;</span>')
     assert not entry.widget.description_allow_html
-    assert found.folders[0]["function"] == "<b>f</b>"
+    assert found.folders[0]["functions"] == ["<b>f</b>"]
 
 
 def test_all_controls_share_their_layout_and_their_styles(edges: ep.CompGraphRunner) -> None:
     made = controls(edges, HINTS)
     assert len({entry.widget.layout.model_id for entry in made}) == 1
     assert len({entry.widget.style.model_id for entry in made}) == 1
-    boxes = column(edges.cg, made).widget.children
+    search, folders = column(edges.cg, made).widget.children
+    boxes = [search, folders, *folders.children]
     assert len({box.layout.model_id for box in boxes}) == 1
 
 

@@ -379,3 +379,37 @@ def test_a_hand_that_moves_in_the_middle_of_a_write_is_heard(
     entry.write({"x": written})
     hands[0].join(60)
     assert (at(entry), told) == (meant, [{"x": meant}])
+
+
+# -- a range that is widened --------------------------------------------------------------------------------------
+
+
+def test_a_value_outside_of_the_soft_range_widens_the_slider_until_it_returns() -> None:
+    control = made(70, ep.Param(soft=(0, 100)))
+    slider = control.widget
+    told = moves(control)
+    control.write({"x": 700})
+    assert (slider.min, slider.max, slider.value) == (0, 700, 700)
+    slider.value = 40
+    control.write({"x": 30})
+    assert slider.max == 700, "what was typed once can be dragged to again"
+    control.write({"x": 70}, is_return=True)
+    assert (slider.min, slider.max, at(control)) == (0, 100, 70)
+    control.write({"x": -30}, is_return=True)
+    assert (slider.min, slider.max, at(control)) == (-30, 100, -30)
+    assert told == [{"x": 40}]
+
+
+@pytest.mark.parametrize("value", [np.bool_(False), np.bool_(True)])
+def test_a_truth_value_of_numpy_has_a_tick_box(value: Any) -> None:
+    control = made(value)
+    assert (control.kind, control.widget.value, type(at(control))) == ("check", bool(value), type(value))
+    control.widget.value = not value
+    assert at(control) == np.bool_(not value)
+    assert type(at(control)) is np.bool_
+
+
+def test_numbers_and_truth_values_of_numpy_are_written_as_short_as_they_are() -> None:
+    runner = runner_of(x=np.float32(0.3), is_on=np.bool_(True))
+    assert [row["default"] for row in column(runner.cg, controls(runner, {})).rows] == [[0.3], [True]]
+    assert at(made(np.float32(0.3))).dtype == np.float32

@@ -125,7 +125,12 @@ def test_settings_go_to_a_file_and_come_back(panel: Panel, screen: FrontEnd, tmp
         "text": "Saved better.toml.",
         "ok": True,
     }
+    (tmp_path / "my").mkdir()
+    screen.tell("save", name="my/../worse")
+    assert screen.last("settings")["text"].startswith("'my/../worse' has '..' in it")
+    assert not (tmp_path / "worse.toml").exists()
     screen.tell("load", name="bettr")
+    assert "in this folder" in screen.last("settings")["text"]
     assert screen.last("settings")["ok"] is False
     assert "better" in screen.last("settings")["text"]
     (tmp_path / "good.toml").write_text((tmp_path / "good.toml").read_text().replace("77", "777"))

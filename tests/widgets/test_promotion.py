@@ -184,9 +184,9 @@ def test_a_report_that_fails_ends_nothing(edges: ep.CompGraphRunner, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("token", "folder"),
-    [("edges", "services/edges"), ("a/b c", "services/a-b-c"), ("..", "services/graph"), ("", "services/graph"),
-     (None, "services/graph"), ("größe", "services/größe"), ("x" * 500, "services/" + "x" * 60)],
+    ("outputs", "folder"),
+    [(["edges"], "services/edges"), (["a/b c"], "services/a-b-c"), ([".."], "services/graph"), ([], "services/graph"),
+     (["mask", "area"], "services/mask-area"), (["größe"], "services/größe"), (["x" * 500], "services/" + "x" * 60)],
 )  # fmt: skip
-def test_a_folder_is_proposed_for_any_token(token: str | None, folder: str) -> None:
-    assert proposal(token) == folder
+def test_a_folder_is_proposed_after_the_outputs_that_are_promoted(outputs: list[str], folder: str) -> None:
+    assert proposal(outputs) == folder

@@ -477,16 +477,48 @@ def test_a_payload_that_is_run_anew_is_compared_anew(
     assert sum("No entry 77" in line for line in panel.log) == 1
 
 
-def test_the_last_values_that_failed_are_no_step_of_undo(panel: Panel, runner: ep.CompGraphRunner) -> None:
+def test_undo_leads_from_values_that_failed_to_the_last_that_completed(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
     panel["threshold"] = 60
     panel.wait(60)
     panel["threshold"] = 13
     panel.wait(60)
-    assert panel.undo()
-    panel.wait(60)
-    assert (runner["threshold"], list(panel.history["threshold"])) == (100, [100, 60])
+    for value in (60, 100):
+        assert panel.undo()
+        panel.wait(60)
+        assert (runner["threshold"], panel["threshold"]) == (value, value)
+    assert (panel.error, list(panel.history["threshold"])) == ("", [100, 60])
     assert panel.redo()
     assert not panel.redo()
+
+
+def test_the_first_values_can_be_gone_back_to_from_what_fails_on_them(panel: Panel, front_end: FrontEnd) -> None:
+    panel.wait(60)
+    assert not front_end.last("history")["undo"]
+    panel["threshold"] = 13
+    panel.wait(60)
+    assert front_end.last("history")["undo"]
+    front_end.tell("undo")
+    panel.wait(60)
+    front_end.wait_for_values(10, threshold=100)
+    assert (panel["threshold"], front_end.last("history")["undo"]) == (100, False)
+    for threshold in (13, 100):
+        front_end.tell("set", values={"threshold": threshold})
+        panel.wait(60)
+    assert not front_end.last("history")["undo"]
+
+
+def test_what_is_compared_with_follows_the_stage_while_a_run_fails(panel: Panel, front_end: FrontEnd) -> None:
+    panel.wait(60)
+    front_end.tell("compare", **{"with": {"kind": "default"}})
+    front_end.tell("pin", token="mask", on=True)
+    panel["threshold"] = 13
+    panel.wait(60)
+    front_end.tell("stage", token="image_bright")
+    panel.wait(60)
+    assert front_end.last("frame")["stale"]
+    assert front_end.last("reference")["picture"]["token"] == "image_bright"
 
 
 def test_whatever_a_hyperparameter_is_a_frame_stays_small() -> None:

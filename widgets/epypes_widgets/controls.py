@@ -23,14 +23,14 @@ from epypes.hints import Param, Roi, Text
 from epypes_widgets.ranges import Range, allows, ranges
 from epypes_widgets.scale import Scale, exponent, refused, same_type, scale_of
 from epypes_widgets.tooltips import tooltip
-from epypes_widgets.values import is_same, numpy_type, sendable
+from epypes_widgets.values import is_same, is_truth, numpy_type, sendable
 
 if TYPE_CHECKING:
     from epypes_widgets.session import Tunable
 
 # A longer text is a document, not a parameter: it would travel with every message about its box.
 _MAX_TEXT: Final = 2_000
-_DESCRIPTION_WIDTH: Final = "112px"
+_DESCRIPTION_WIDTH: Final = "42%"
 
 
 class _Quiet(ipywidgets.Widget):
@@ -137,8 +137,12 @@ class Control:
         with self._lock:
             return self._checked(values)
 
-    def write(self, values: Mapping[str, Any]) -> None:
-        """Move to values of some or all of the tokens, without a call of the listeners; errors as ``check``."""
+    def write(self, values: Mapping[str, Any], *, is_return: bool = False) -> None:
+        """Move to values of some or all of the tokens, without a call of the listeners; errors as ``check``.
+
+        A slider whose range does not hold a value is widened, and stays so until it returns to an earlier value: its
+        range is then the first one, as far as that holds the value.
+        """
         with self._lock:
             checked = self.check(values)
             # A move by the user on another thread waits for the lock, and then differs from what was written.
@@ -146,6 +150,8 @@ class Control:
             self._is_writing = True
             try:
                 self._place(checked)
+                if is_return:
+                    self._narrow()
             finally:
                 self._is_writing = False
 
@@ -175,6 +181,9 @@ class Control:
 
     def _place(self, values: Mapping[str, Any]) -> None:
         raise NotImplementedError
+
+    def _narrow(self) -> None:
+        """Offer no wider a range than at first, but for the present value."""
 
 
 class SingleControl(Control):
@@ -254,6 +263,7 @@ class SliderControl(SingleControl):
             slider = _IntSlider if scale.integer else _FloatSlider
             widget = slider(value=scale.place(value), min=scale.low, max=scale.high, **common)
         self._scale, self._snap = scale, _Snap(scale, scale.step)
+        self._first_ends = widget.min, widget.max
         self._snap.put(value, widget.value)
         self.integer, self.steps = scale.integer, (scale.step,)
         super().__init__(scale.name, scale.param, widget, value, first, "log" if scale.param.log else "slider")
@@ -274,6 +284,10 @@ class SliderControl(SingleControl):
         self._snap.put(value, place)
         return place
 
+    def _narrow(self) -> None:
+        low, high = self._first_ends
+        self.widget.min, self.widget.max = self._scale.grown(low, high, self._read()[self.names[0]])
+
 
 class RangeControl(Control):
     """A slider with two handles for two hyperparameters; the lower value never exceeds the upper one."""
@@ -291,6 +305,7 @@ class RangeControl(Control):
         ends = {"min": min(low.low, high.low), "max": max(low.high, high.high), "step": min(low.step, high.step)}
         places = low.place(values[0]), high.place(values[1])
         self._slider = slider(value=places, **ends, readout=False, continuous_update=False, **appearance)
+        self._first_ends = self._slider.min, self._slider.max
         self._snaps = _Snap(low, self._slider.step), _Snap(high, self._slider.step)
         self._places: tuple[float, ...] = ()
         self._settle(values, self._slider.value)
@@ -327,6 +342,12 @@ class RangeControl(Control):
         self._settle((low, high), places)
         slider.value = places
 
+    def _narrow(self) -> None:
+        ends = self._first_ends
+        for scale in self._scales:
+            ends = scale.grown(*ends, self._read()[scale.name])
+        self._slider.min, self._slider.max = ends
+
     def _settle(self, values: tuple[Any, Any], places: tuple[float, float]) -> None:
         self._values, self._places = values, places
         for snap, value, place in zip(self._snaps, values, places, strict=True):
@@ -360,7 +381,7 @@ class ChoiceControl(SingleControl):
 
     def __init__(self, name: str, value: Any, param: Param, first: Any, appearance: Appearance, tooltip: str) -> None:
         self._choices, self._numpy_type = param.choices or (), numpy_type(value)
-        is_check = all(map(_is_truth, self._choices)) and sorted(self._choices) == [False, True]
+        is_check = all(map(is_truth, self._choices)) and sorted(self._choices) == [False, True]
         if is_check:
             self._choices = (False, True)
             box: Any = ipywidgets.Checkbox(value=bool(value), **appearance.of((name,), tooltip, CheckboxStyle))
@@ -405,13 +426,9 @@ def choice_index(choices: tuple[Any, ...], value: Any) -> int | None:
 
 def _equals(choice: Any, value: Any) -> bool:
     try:
-        return _is_truth(choice) == _is_truth(value) and bool(choice == value)
+        return is_truth(choice) == is_truth(value) and bool(choice == value)
     except Exception:  # an array, or a class of one's own: it is another value
         return False
-
-
-def _is_truth(value: Any) -> bool:
-    return isinstance(value, bool) or getattr(numpy_type(value), "__name__", "") in ("bool", "bool_")
 
 
 def _label(choice: Any) -> str:
@@ -492,13 +509,13 @@ def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
             continue
         names = tuple(along.name for along in pairs[token]) if token in pairs else (token,)
         tips = {name: tooltip(runner.cg, name, params[name]) for name in names}
+        text = tips[token] if len(names) == 1 else "\n".join(f"{name}: {tip}" for name, tip in tips.items() if tip)
         if token in pairs:
-            text = "\n".join(f"{name}: {tip}" for name, tip in tips.items())
             both, firsts = tuple(values[name] for name in names), tuple(first.get(name) for name in names)
             control: Control = RangeControl(pairs[token], both, firsts, appearance.of(names, text, SliderStyle))
         else:
-            control = _single(token, values[token], param, first.get(token), tips[token], appearance)
-        control.tip = "\n".join(tips.values())
+            control = _single(token, values[token], param, first.get(token), text, appearance)
+        control.tip = text
         made |= dict.fromkeys(names, control)
     return tuple(dict.fromkeys(made.values()))
 
@@ -583,10 +600,11 @@ class ControlSet:
             raise UnknownName("hyperparameter", name, self._by_name, "of this panel")
         return self._by_name[name]
 
-    def set(self, values: Mapping[str, Any], *, by_user: bool = False) -> dict[str, Any]:
+    def set(self, values: Mapping[str, Any], *, by_user: bool = False, is_return: bool = False) -> dict[str, Any]:
         """Move controls to values that were set, all or none, and return them as the hyperparameters take them.
 
-        A value for a control that is held waits, unless the user sets it, and is not returned.
+        A value for a control that is held waits, unless the user sets it, and is not returned. On the return to earlier
+        values a slider that was widened gets its first range again.
 
         Raises
         ------
@@ -604,7 +622,7 @@ class ControlSet:
                 if self._is_held(control) and not by_user:
                     self._waiting.update(own)
                     continue
-                control.write(own)
+                control.write(own, is_return=is_return)
                 moved |= {name: control.read()[name] for name in own}
             return moved
 
@@ -614,8 +632,10 @@ class ControlSet:
             if model in self._widgets:
                 self._widgets[model].set_state({"value": place})
 
-    def follow(self, values: Mapping[str, Any]) -> list[str]:
+    def follow(self, values: Mapping[str, Any], *, is_return: bool = False) -> list[str]:
         """Move controls to values of the runner; those that are held follow when they are released.
+
+        ``is_return`` as for ``set``.
 
         Returns
         -------
@@ -629,7 +649,7 @@ class ControlSet:
                     self._waiting.update(own)
                     continue
                 try:
-                    control.write(own)
+                    control.write(own, is_return=is_return)
                 except ValueError as error:
                     refused.append(f"The control stays where it was: {error}")
         return refused

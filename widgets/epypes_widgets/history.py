@@ -54,6 +54,8 @@ class Entry:
         A word of the user's or the panel's on it; may be empty.
     image
         Which of the panel's images it was computed on, from 0; None if it has no list of them.
+    left
+        The number of the entry that was left for it; 0 for the first.
     """
 
     number: int
@@ -64,6 +66,7 @@ class Entry:
     compute_ms: float | None = None
     label: str = ""
     image: int | None = None
+    left: int = 0
 
 
 class History:
@@ -132,7 +135,8 @@ class History:
             kept = {name: copy.copy(value) if type(value) in mutable else value for name, value in values.items()}
             self._committed += 1
             now = datetime.now().astimezone().replace(microsecond=0)
-            entry = Entry(self._committed, MappingProxyType(kept), now, image=image, **about)
+            left = 0 if current is None else current.number
+            entry = Entry(self._committed, MappingProxyType(kept), now, image=image, left=left, **about)
             self._entries = (*self._entries, entry)[-self.limit :]
             oldest = self._entries[0].number
             walked = self._path[: self._place + 1]
@@ -188,6 +192,10 @@ class History:
         """All entries that are kept, the oldest first, wherever undo and redo lead."""
         return self._entries
 
+    def left_for(self, entry: Entry) -> Entry | None:
+        """Return the entry that was left for another; None for the first, and if it is no longer kept."""
+        return next((each for each in self._entries if each.number == entry.left), None)
+
     def to_frame(self) -> HistoryTable:
         """Return a pandas table by number that shows its thumbnails in a notebook.
 
@@ -222,10 +230,10 @@ def history_of(runner: Tunable) -> History:
         return _histories.setdefault(runner, History())
 
 
-def changed(before: Entry | None, after: Entry, frames: Sequence[int] | None = None) -> str:
+def changed(before: Entry | None, after: Entry, frames: Sequence[int] | None = None, most: int = 3) -> str:
     """Return what an entry has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; empty for the first.
 
-    ``frames``: the numbers of the frames, where the images are those of a video.
+    ``frames``: the numbers of the frames, where the images are those of a video. ``most``: so many names at most.
     """
     if before is None:
         return ""
@@ -235,7 +243,7 @@ def changed(before: Entry | None, after: Entry, frames: Sequence[int] | None = N
         "-" if entry.image is None or entry.image >= len(numbers) else numbers[entry.image] for entry in (before, after)
     )
     moved = f"{'image' if frames is None else 'frame'} {one} -> {other}" if one != other else ""
-    return ", ".join(filter(None, (change_text(before.values, after.values), moved)))
+    return ", ".join(filter(None, (change_text(before.values, after.values, most), moved)))
 
 
 # The prefix of the row keys of a history: the entries of every history count from 1.
@@ -311,7 +319,7 @@ class StoredHistory:
         return {
             "at": entry.at.isoformat(),
             "values": values,
-            "changed": changed(self._last, entry),
+            "changed": changed(self._history.left_for(entry), entry),
             "total_ms": entry.compute_ms,
             # Of a service's hyperparameters.
             "revision": getattr(self._runner, "revision", None),

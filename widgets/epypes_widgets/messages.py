@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import EpypesError
@@ -51,13 +52,14 @@ class Messages:
         tuning, screen = self._tuning, self._screen
         return {
             "ready": self._ready,
+            "ping": lambda _: screen.view.tell("pong", {}),
             "seen": lambda _: tuning.seen(),
             "left": self._left,
             "hold": lambda message: tuning.controls.hold(message["names"]),
             "release": lambda _: tuning.release(),
             "set": lambda message: self._set(message["values"]),
             "move": self._move,
-            "reset": lambda message: self._set(tuning.first_values(message["names"])),
+            "reset": lambda message: self._set(tuning.first_values(message["names"]), is_return=True),
             "live": self._live,
             "run": lambda _: tuning.run(),
             "image": lambda message: tuning.want_image(int(message["index"])),
@@ -66,7 +68,7 @@ class Messages:
             "compare": self._compare,
             "histogram": lambda message: tuning.look(has_histogram=bool(message["on"])),
             "probe": self._probe,
-            "undo": lambda _: tuning.go_to(tuning.history.undo),
+            "undo": lambda _: tuning.undo(),
             "redo": lambda _: tuning.go_to(tuning.history.redo),
             "goto": lambda message: tuning.go_to(lambda: tuning.history.goto(int(message["number"]))),
             "save": lambda message: self._file(message, self._saved),
@@ -88,10 +90,10 @@ class Messages:
 
     # -- values -------------------------------------------------------------------------------------------------
 
-    def _set(self, values: Mapping[str, Any], *, commit: bool = True, by_user: bool = True) -> None:
+    def _set(self, values: Mapping[str, Any], **how: bool) -> None:
         try:
             if values:
-                self._tuning.want(values, commit=commit, by_user=by_user)
+                self._tuning.want(values, **{"by_user": True, **how})
         except ValueError as error:
             self._screen.fail(str(error), names=tuple(values))
 
@@ -144,13 +146,17 @@ class Messages:
     def _file(self, message: Message, act: Callable[[str], str]) -> None:
         """Read or write settings, and say what came of it."""
         try:
-            text, is_done = act(str(message["name"]).strip()), True
+            name = str(message["name"]).strip()
+            if ".." in Path(name).parts:
+                way_out = f"Name them {Path(name).name!r}; panel.save(path) and panel.load(path) take any path."
+                raise ValueError(f"{name!r} has '..' in it, which leads out of a folder. {way_out}")
+            text, is_done = act(name), True
         except (EpypesError, ValueError) as error:
             text, is_done = str(error), False
         self._screen.view.tell("settings", {"names": list(settings.names(".")), "text": text, "ok": is_done})
 
     def _saved(self, name: str) -> str:
-        return f"Saved {self._panel.save(name).name}."
+        return f"Saved {self._panel.save(name)}."
 
     def _loaded(self, name: str) -> str:
         self._panel.load(name)

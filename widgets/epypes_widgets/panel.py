@@ -131,7 +131,8 @@ class Panel(Displayed):
 
     def reset(self, /, *names: str) -> None:
         """Set hyperparameters to the values that the runner had them frozen with; all without names."""
-        self.set(**self._tuning.first_values(names))
+        self._require_open()
+        self._tuning.want(self._tuning.first_values(names), is_return=True)
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""
@@ -221,9 +222,9 @@ class Panel(Displayed):
         return self._stored.to_frame()
 
     def undo(self) -> bool:
-        """Go back to the values before; False if there are none."""
+        """Go back to the values before, which are the last that completed if a function failed; False without any."""
         self._require_open()
-        return self._tuning.go_to(self._history.undo)
+        return self._tuning.undo()
 
     def redo(self) -> bool:
         """Go on to the values that ``undo`` left; False if there are none."""
@@ -347,7 +348,7 @@ class Panel(Displayed):
                 for name, param in self._controls.params.items()
                 if isinstance(param, Roi)
             ],
-            "promote_to": proposal(self.token),
+            "promote_to": proposal(self._runner.cg.sink_tokens),
             "writes_back": self._session.is_service,
             "settings": list(settings.names(".")),
             "optimise": None if self.search is None else self.search.content(),

@@ -121,15 +121,15 @@ def _text_of(error: BaseException) -> str:
     return text if isinstance(error, PromotionRefused) else f"Not done: {text}{notes}"
 
 
-def proposal(token: str | None) -> str:
-    """Return a folder to promote to, by the token that is shown.
+def proposal(outputs: Sequence[str]) -> str:
+    """Return a folder to promote to, by the tokens that the service will answer with.
 
     Examples
     --------
-    >>> proposal("edges"), proposal("a/b c"), proposal(None)
-    ('services/edges', 'services/a-b-c', 'services/graph')
+    >>> proposal(["edges"]), proposal(["mask", "a/b c"]), proposal([])
+    ('services/edges', 'services/mask-a-b-c', 'services/graph')
     """
-    name = _NOT_IN_A_NAME.sub("-", token or "").strip("-.")[:60]
+    name = _NOT_IN_A_NAME.sub("-", "-".join(outputs)).strip("-.")[:60]
     return f"services/{name or 'graph'}"
 
 

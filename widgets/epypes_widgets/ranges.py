@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 Range = Param | Roi | Text | None
 
 _RECTANGLES: Final = frozenset(("roi", "rect", "rectangle", "crop", "box", "bbox", "window"))
-_THRESHOLDS: Final = frozenset(("thresh", "threshold", "level", "cutoff"))
 _UPPER: Final = {"lo": "hi", "low": "high", "min": "max", "lower": "upper", "minimum": "maximum"}
 _NUMBERED: Final = frozenset(("threshold", "thresh"))
 
@@ -227,12 +226,7 @@ def _cut_by(runner: Tunable, taker: Taker, token: str) -> str:
     entry, used = entry_of(taker.function, taker.parameter), uses(taker.function, taker.parameter)
     compared = [*([entry.cuts] if entry else []), *(use.cuts for use in used)]
     payload = [name for name in runner.cg.func_inputs(taker.name) if name not in runner.hyperparameters]
-    image = next((taker.tokens[name] for name in compared if taker.tokens.get(name) in payload), "")
-    if image:
-        return image
-    is_threshold = bool(_THRESHOLDS & {*_words(taker.parameter), *_words(token)})
-    is_known = entry or any(use.entry for use in used)  # by the catalog: not of values, as the thresholds of Canny
-    return payload[0] if is_threshold and len(payload) == 1 and not is_known else ""
+    return next((taker.tokens[name] for name in compared if taker.tokens.get(name) in payload), "")
 
 
 def _valued(runner: Tunable, token: str, value: Any, known: list[Taker]) -> Range:

@@ -20,7 +20,8 @@ from epypes_widgets.view import PictureView
 
 _MAX_ENTRIES: Final = 40
 _MAX_LINES: Final = 100
-_LINE_CHARACTERS: Final = 500
+_MOST_CHANGES: Final = 20
+_LINE_CHARACTERS: Final = 2_000
 _ERROR_CHARACTERS: Final = 2_000
 
 
@@ -236,6 +237,16 @@ class Screen:
     def _pictures(self) -> set[str]:
         return {token for token, is_picture in self.stages.items() if is_picture}
 
+    @property
+    def is_beyond(self) -> bool:
+        """Whether values are wanted that have no run, beside those of the history's current entry."""
+        current, session = self._history.current, self._session
+        if current is None:
+            return False
+        wanted = {name: value for name, value in session.wanted.items() if name in current.values}
+        is_other = any(not is_same(current.values[name], value) for name, value in wanted.items())
+        return is_other or (session.is_wanting and session.image_wanted != current.image is not None)
+
     # -- on any thread ------------------------------------------------------------------------------------------
 
     def tell(self, kind: str, content: dict[str, Any], buffers: tuple[bytes, ...] = ()) -> None:
@@ -261,9 +272,9 @@ class Screen:
         with self._listing:
             entries, current = self._history.entries, self._history.current
             numbers = self._session.payloads.numbers
-            pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
-            pairs = pairs if len(pairs) <= _MAX_ENTRIES else [pairs[0], *pairs[1 - _MAX_ENTRIES :]]
+            listed = entries if len(entries) <= _MAX_ENTRIES else (entries[0], *entries[1 - _MAX_ENTRIES :])
+            pairs = [(self._history.left_for(entry), entry) for entry in listed]
             self.listed = len(entries) and entries[-1].number
             content = [
                 {
@@ -271,6 +282,7 @@ class Screen:
                     "values": json_values(entry.values),
                     "label": entry.label,
                     "changed": changed(before, entry, numbers),
+                    "about": changed(before, entry, numbers, _MOST_CHANGES),
                     "current": entry is current,
                 }
                 for before, entry in pairs
@@ -278,7 +290,8 @@ class Screen:
             new = [entry.picture if entry.number not in self._pictured else None for _, entry in pairs]
             if self.view.frames.mounted:
                 self._pictured.update(entry.number for _, entry in pairs)
-            state = {"undo": self._history.can_undo, "redo": self._history.can_redo, "code": self.code()}
+            undo = self._history.can_undo or self.is_beyond
+            state = {"undo": undo, "redo": self._history.can_redo, "code": self.code()}
             pictures = [b"" if each is None else each.data for each in new]
             self.view.tell("history", {"entries": content, **state}, pictures)
 

@@ -193,7 +193,8 @@ def _entries(file: Path) -> dict[str, Any]:
             raise SettingsError(file, [f"{file} is no plain file of at most {_MAX_BYTES / 1e6:g} MB."])
         document = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
-        unknown = UnknownName("settings", file.name.removesuffix(_SUFFIX), names(file.parent), f"in {file.parent}")
+        folder = "in this folder" if file.parent == Path() else f"in {file.parent.resolve()}"
+        unknown = UnknownName("settings", file.name.removesuffix(_SUFFIX), names(file.parent), folder)
         raise SettingsError(file, [str(unknown)]) from error
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(file, [f"{file} is not TOML: {error}."]) from error

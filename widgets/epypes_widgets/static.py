@@ -1,8 +1,9 @@
 """The output beside a panel for a saved notebook, where no kernel runs: its last picture and values.
 
 The widget alone leaves nothing there: beside it stands an output of plain HTML, which the live panel hides. It has
-text, borders and one picture: no script, no style sheet, no colours of its own, so that it is readable on any ground,
-also where a page does not trust the notebook.
+text, borders and one picture: no script and no colours of its own, so that it is readable on any ground, also where a
+page does not trust the notebook. Where a page does, JupyterLab shows the widget's output, and finds no model for it: a
+rule hides the error that it puts there. Where a page does not, it drops both the widget's output and the rule.
 """
 
 from __future__ import annotations
@@ -24,12 +25,18 @@ from epypes_widgets.values import differing, short_text
 _PICTURE_BYTES: Final = 72_000
 _PICTURE_SIDE_PX: Final = 720
 _MAX_ROWS: Final = 40
-_NAME_CHARACTERS: Final = 40
+_NAME_CHARACTERS: Final = 80
 # What a text takes in the page at most.
 _CELL_ROOM: Final = 80
 _TEXT_ROOM: Final = 800
 # Within the picture, since an output cuts off what is around it.
 _FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outline-offset:-1px"
+# True also where the panel lives and this can't be hidden, as in VS Code.
+_KEPT: Final = (
+    "<style>.jp-OutputArea-child:not(:has(.epypes-view:not(.epypes-void), .epypes-picker))"
+    ":has(+ .jp-OutputArea-child .epypes-kept) {display: none}</style>"
+    '<p style="margin:0 0 8px">Kept from the last run: run this cell again to go on.</p>'
+)
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
 
 
@@ -61,13 +68,17 @@ class StaticOutput:
     Parameters
     ----------
     html
-        Returns what it shows now.
+        Returns what it shows now, below a line on what to do.
     """
 
     def __init__(self, html: Callable[[], str]) -> None:
-        self.html = html
+        self._html = html
         self._handle: Any = None
         self._shown = ""
+
+    def html(self) -> str:
+        """Return what it shows now."""
+        return f'<div class="epypes-kept">{_KEPT}{self._html()}</div>'
 
     def display(self) -> None:
         """Show it below the outputs of the running cell."""

@@ -106,12 +106,14 @@ class Tuning:
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
-    def want(self, values: Mapping[str, Any], *, commit: bool = True, by_user: bool = False) -> None:
+    def want(
+        self, values: Mapping[str, Any], *, commit: bool = True, by_user: bool = False, is_return: bool = False
+    ) -> None:
         """Move controls to values and have them computed; ValueError, and nothing is done, if one is out of range."""
         if by_user:
             values = self.controls.moved(values)
         with self._lock:  # of two threads the one whose value stands is wanted last
-            self.session.want(self.controls.set(values, by_user=by_user))
+            self.session.want(self.controls.set(values, by_user=by_user, is_return=is_return))
         self._wanted(commit=commit)
 
     def first_values(self, names: Sequence[str] = ()) -> dict[str, Any]:
@@ -147,6 +149,11 @@ class Tuning:
         self._is_forced = self._commits = True
         self._request()
 
+    def undo(self) -> bool:
+        """Go to the values before, which are those of the present entry if what is wanted now has no run."""
+        history = self.history
+        return self.go_to(lambda: history.current if self.screen.is_beyond else history.undo())
+
     def go_to(self, find: Callable[[], Entry | None]) -> bool:
         """Go to the entry of the history that is found after the present values were committed; False if none is."""
         run = self.session.result
@@ -157,7 +164,7 @@ class Tuning:
             return False
         values = {name: value for name, value in entry.values.items() if name in self.runner.hyperparameters}
         with self._lock:
-            self.screen.log(*self.controls.follow(values))
+            self.screen.log(*self.controls.follow(values, is_return=True))
             self.session.want(values)
         if entry.image not in (None, self.session.image_wanted) and entry.image in range(len(self.session.payloads)):
             self.session.want_image(entry.image or 0)
@@ -240,29 +247,35 @@ class Tuning:
             self._show_run(is_wanted, changed_ns if is_moved else 0)
 
     def _show_run(self, is_wanted: bool, changed_ns: int) -> None:
+        # Taken here: what is asked for while this is computed is committed by the next run.
+        commits, self._commits = self._commits, False
         try:
             run, is_settled = self._tried(is_wanted)
         except Superseded:  # what was computed for it is kept, and the newer request is next
-            self._is_forced, self._has_looked = is_wanted, True
+            self._is_forced, self._has_looked, self._commits = is_wanted, True, self._commits or commits
             return
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
+            self._commits |= commits
             if not self.worker.closed:
                 self._refuse(error)
             return
         if self.worker.closed:
             return
         if run.failure is not None:
+            self._commits |= commits
             self._fail(run, run.failure)
-            return
-        self.screen.follow(run)
-        self.screen.show(run, changed_ns)
-        self._show_notice()
-        if not is_settled:
-            self.session.insist()
-            self._commit_later(REST_S)
-        elif self._commits:
-            self._commits = False
-            self._commit(is_final=True)
+        else:
+            had_failed = bool(self.screen.error)
+            self.screen.follow(run)
+            self.screen.show(run, changed_ns)
+            if had_failed:  # there is nothing left that could be undone
+                self.screen.send_history()
+            self._show_notice()
+            if not is_settled:
+                self.session.insist()
+                self._commit_later(REST_S)
+            elif commits:
+                self._commit(is_final=True)
         self._compare()
 
     def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
@@ -328,7 +341,10 @@ class Tuning:
         good = self.session.result
         if good is not None:
             self.screen.show(good, 0, failed=run)
+        had_failed = bool(self.screen.error)
         self.screen.fail(str(failure), failure.function, self._at_fault(run, failure.function))
+        if not had_failed:  # what failed can be undone
+            self.screen.send_history()
 
     def _at_fault(self, run: Run, function: str) -> list[str]:
         """Return what was set and goes into a function, or into what it is given; if nothing was, all that it takes."""
@@ -343,7 +359,7 @@ class Tuning:
     def _commit(self, *, is_final: bool = False) -> None:
         """Add the values that the runner has taken over to the history, unless they are there or held."""
         run = self.session.result
-        if run is None or self.session.wanted or (self.controls.is_holding and not is_final):
+        if run is None or ((self.session.wanted or self.controls.is_holding) and not is_final):
             return
         self._add(run)
         entries = self.history.entries

@@ -20,7 +20,7 @@ _LARGEST_INTEGER: Final = 2**53 // 3
 _LARGEST_IN_JSON: Final = 2**63
 _CONTAINERS: Final = (tuple, list, dict)
 _MAX_NAMED: Final = 3
-_MAX_CHANGE_CHARACTERS: Final = 120
+_CHANGE_CHARACTERS: Final = 40
 _MAX_CHARACTERS: Final = 1_000
 _MAX_ITEMS: Final = 100
 
@@ -33,6 +33,11 @@ def is_number(value: Any) -> bool:
         return math.isfinite(float(value))
     except (OverflowError, TypeError, ValueError):  # 10**400, or a duration of NumPy, which calls itself an integer
         return False
+
+
+def is_truth(value: Any) -> bool:
+    """Whether a value is True or False, of Python or of NumPy."""
+    return isinstance(value, bool) or getattr(numpy_type(value), "__name__", "") in ("bool", "bool_")
 
 
 def is_integer(value: Any) -> bool:
@@ -52,10 +57,17 @@ def numpy_type(value: Any) -> type | None:
 
 
 def as_python(number: Any) -> Any:
-    """Return a movable number as an int or a float of Python, anything else as it is."""
+    """Return a truth value or a movable number as Python's, anything else as it is."""
+    if is_truth(number):
+        return bool(number)
     if not is_movable(number):
         return number
-    return int(number) if isinstance(number, numbers.Integral) else float(number)
+    return int(number) if isinstance(number, numbers.Integral) else _shortest(number)
+
+
+def _shortest(number: Any) -> float:
+    """Return a real number as a float: of NumPy's float32 0.3, not 0.30000001192092896."""
+    return float(number if numpy_type(number) is None else str(number))
 
 
 # -- the same -----------------------------------------------------------------------------------------------------
@@ -118,13 +130,13 @@ def setting_text(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {short_text(value)}" for name, value in values.items())
 
 
-def change_text(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
-    """Return what has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; of more than three names, how many."""
+def change_text(before: Mapping[str, Any], after: Mapping[str, Any], most: int = _MAX_NAMED) -> str:
+    """Return what has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; of more names than ``most``, how many."""
     names = differing(before, after)
-    parts = [f"{name} {_step(before, after, name)}" for name in names[:_MAX_NAMED]]
-    more = [f"and {len(names) - _MAX_NAMED} more"] if len(names) > _MAX_NAMED else []
-    text = ", ".join([*parts, *more])
-    return text if len(text) <= _MAX_CHANGE_CHARACTERS else text[: _MAX_CHANGE_CHARACTERS - 1] + "…"
+    parts = [f"{name} {_step(before, after, name)}" for name in names[:most]]
+    more = [f"and {len(names) - most} more"] if len(names) > most else []
+    text, room = ", ".join([*parts, *more]), most * _CHANGE_CHARACTERS
+    return text if len(text) <= room else text[: room - 1] + "…"
 
 
 def _step(before: Mapping[str, Any], after: Mapping[str, Any], name: str) -> str:
@@ -159,10 +171,12 @@ def json_value(value: Any) -> Any:
     if isinstance(value, enum.Enum):
         return value.name
     try:
-        if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        if is_truth(value):
+            return bool(value)
+        if isinstance(value, numbers.Integral):
             value = int(value) if abs(int(value)) <= _LARGEST_IN_JSON else short_repr(value)
-        elif isinstance(value, numbers.Real) and not isinstance(value, bool):
-            value = float(value)
+        elif isinstance(value, numbers.Real):
+            value = _shortest(value)
         elif isinstance(value, tuple | list) and len(value) > _MAX_ITEMS:
             return short_repr(value)
         # JSON has neither infinity nor NaN.

@@ -1,8 +1,9 @@
-"""A picture in a page: how it is explored, its twin for screen readers, its functions' sources.
+"""A picture in a page: how it is explored, its twin for screen readers, its functions' sources, its tokens' pictures.
 
 The picture is an ``<img>`` of the SVG, which the script replaces by the SVG itself: a page that does not trust a
 notebook strips scripts and would strip inline SVG down to its loose words, but keeps the image. Where the script runs,
-the picture takes the page's colours and can be explored (``explore.js``).
+the picture takes the page's colours and can be explored (``explore.js``). So it is with the pictures of tokens that are
+kept: without a script they are opened below the graph, else the script shows them beside it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any, Final
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
+from epypes.display.previews import Picture
 from epypes.display.text import (
     CHARACTERS,
     CHARACTERS_OF_A_VERTEX,
@@ -28,14 +30,14 @@ from epypes.display.text import (
     fitted,
     size,
 )
-from epypes.display.views.graphview import FunctionView, GraphView
+from epypes.display.views.graphview import FunctionView, GraphView, has_picture
 from epypes.display.views.groups import function_count
 from epypes.wording import counted
 
 _NAMED_CHARACTERS: Final = 200
 _CAPTION_ROOM: Final = 1_500
 # Taken away by the script.
-_STILL: Final = '<p class="epypes-still" style="font-size:12px"><i>Trust the notebook to explore this picture.</i></p>'
+_STILL: Final = '<p class="epypes-still" style="font-size:12px"><i>Trust the notebook to explore the graph.</i></p>'
 # A twin without rows, and what stands beside it.
 _TWIN_CHARACTERS: Final = len(paint_twin(GraphView((), (), ()), "", 0)) + len(_STILL)
 
@@ -47,10 +49,17 @@ _END: Final = "</figure>"
 _WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
 
 
-def paint_page(*parts: str) -> str:
-    """Return what is shown together, such as a figure and the tables below it, with what it takes to explore it."""
+def paint_page(*parts: str, address: str = "") -> str:
+    """Return what is shown together, such as a figure and the tables below it, with what it takes to explore it.
+
+    Parameters
+    ----------
+    address
+        Where the script finds the run that is shown; empty if it is in no kernel.
+    """
+    run = f' data-run="{escape(address)}"' if address else ""
     return (
-        f'<div class="epypes-sheet">{"".join(parts)}<style>{PAGE_STYLE}{_asset("css")}</style>'
+        f'<div class="epypes-sheet"{run}>{"".join(parts)}<style>{PAGE_STYLE}{_asset("css")}</style>'
         f"<script>{_asset('js')}</script></div>"
     )
 
@@ -75,7 +84,7 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     text = content(fitted(caption, _CAPTION_ROOM))
     below = f'<figcaption style="font-size:12px">{text}</figcaption>' if caption else ""
     return (
-        f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto;scrollbar-width:thin">'
+        f'<figure class="epypes-figure" style="margin:0"><div class="epypes-view" style="overflow:auto">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
         f"</div>{below}{_END}"
     )
@@ -116,6 +125,17 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     details = [_inside(name, part, figure) for name, part, figure in zip(names, parts[1:], insides, strict=False)]
     left_out = _left_out(names[len(details) :])
     return [first, *details, *([left_out] if left_out else [])]
+
+
+def paint_kept(kept: Mapping[str, Picture]) -> str:
+    """Return the pictures of tokens that a page keeps, by their names; to be opened where no script runs."""
+    pictures = "".join(
+        f'<figure style="display:inline-block;margin:4px"><img src="{escape(picture.uri)}" alt="{escape(name)}" '
+        f'style="max-width:100%"><figcaption>{content(cut(name, _NAMED_CHARACTERS))}</figcaption></figure>'
+        for name, picture in kept.items()
+    )
+    summary = "<summary>Its images, larger</summary>"
+    return f'<details class="epypes-kept" style="font-size:12px">{summary}{pictures}</details>' if kept else ""
 
 
 def _explained(figure: str, graph: GraphView, alt: str, room: int) -> str:
@@ -180,7 +200,7 @@ def _data(graph: GraphView, kept: Mapping[Texts, Sequence[int]]) -> str:
     """Return what the script needs to know, as text that does nothing by itself.
 
     Edges by function, a token that no run reads as its complement; then by function which of the texts are its own,
-    null if they were left out.
+    null if they were left out; then by token the names of those with a picture.
     """
     owner = {place: index for index, places in enumerate(kept.values()) for place in places}
     io: list[tuple[list[int], list[int]]] = [([], []) for _ in graph.functions] if graph.draws_edges else []
@@ -191,6 +211,7 @@ def _data(graph: GraphView, kept: Mapping[Texts, Sequence[int]]) -> str:
         "groups": {place: each.name for place, each in enumerate(graph.functions) if each.kind == "group"},
         "about": [owner.get(place, _unexplained(each)) for place, each in enumerate(graph.functions)],
         "texts": list(kept),
+        "images": {place: each.name for place, each in enumerate(graph.tokens) if has_picture(each)},
     }
     return f'<script type="application/json" class="epypes-data">{_json(data)}</script>'
 

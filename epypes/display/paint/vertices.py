@@ -7,7 +7,6 @@ is seen of a vertex and where it stands, so that a picture of other values is th
 
 from __future__ import annotations
 
-import base64
 import re
 import zlib
 from collections.abc import Sequence
@@ -366,10 +365,9 @@ def paint_thumbnail(shown: Preview, top: Point) -> str:
 def _picture(picture: Picture, top: Point) -> str:
     scale = min(THUMB_WIDTH / picture.width, THUMB_HEIGHT / picture.height)
     width, height = picture.width * scale, picture.height * scale
-    data = base64.b64encode(picture.data).decode()
     return (
         f'<image x="{top[0] - width / 2:.1f}" y="{top[1] + (THUMB_HEIGHT - height) / 2:.1f}" width="{width:.1f}" '
-        f'height="{height:.1f}" href="data:{escape(picture.media_type)};base64,{data}"/>'
+        f'height="{height:.1f}" href="{escape(picture.uri)}"/>'
     )
 
 

@@ -49,6 +49,11 @@ class TokenView(NamedTuple):
     delayed: str = ""
 
 
+def has_picture(token: TokenView) -> bool:
+    """Whether the thumbnail of a token is an encoded picture, not a chart."""
+    return token.preview is not None and token.preview.picture is not None
+
+
 class FunctionView(NamedTuple):
     """What is to be seen of a function.
 
@@ -194,8 +199,7 @@ def from_json(written: Mapping[str, Any]) -> GraphView:
 
 def _written(value: Any) -> Any:
     if isinstance(value, Picture):
-        data = base64.b64encode(value.data).decode()
-        return {"uri": f"data:{value.media_type};base64,{data}", "width": value.width, "height": value.height}
+        return {"uri": value.uri, "width": value.width, "height": value.height}
     if is_dataclass(value):
         return {field.name: _written(getattr(value, field.name)) for field in fields(value)}
     if hasattr(value, "_asdict"):

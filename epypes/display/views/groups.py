@@ -1,13 +1,14 @@
 """Groups: functions that are drawn as one box.
 
 A group is given by ``ep.group``, or by the names of functions: in a large graph those of one prefix, such as
-``left.blur`` and ``left.canny``, are one group.
+``left.blur`` and ``left.canny``, are one group. Where that is not enough, stretches of the data's way are groups.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from typing import Final
 
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, GroupView, TokenView
@@ -15,7 +16,7 @@ from epypes.graph import CompGraph
 from epypes.wording import counted
 
 # A graph of so many functions fits on a page; every one that is hidden costs a click.
-_MOST_SHOWN: Final = 24
+MOST_SHOWN: Final = 24
 # Two functions take hardly more room than the box of their group.
 _LEAST_SHARED: Final = 3
 _REDEFINED: Final = "redefined inside: build again"
@@ -36,7 +37,7 @@ def groups_of(functions: Collection[str], given: Mapping[str, Sequence[str]]) ->
         The groups that were made by ``ep.group``; others are found by the prefixes of names, if the functions are many.
     """
     found = {name: tuple(inside) for name, inside in given.items()}
-    if len(functions) <= _MOST_SHOWN:
+    if len(functions) <= MOST_SHOWN:
         return found
     grouped = {name for inside in given.values() for name in inside}
     alike: dict[str, list[str]] = {}
@@ -207,3 +208,60 @@ def _part(graph: GraphView, places: Collection[int], hidden: Mapping[int, str]) 
 def function_count(graph: GraphView) -> int:
     """Return how many functions there are, those inside groups included."""
     return len(graph.functions) + sum(len(group.graph.functions) - 1 for group in graph.groups)
+
+
+# -- stretches of a graph that is too large for a page ----------------------------------------------------------------
+
+# The functions of a large graph become so many boxes, roughly.
+_BOXES: Final = 10
+
+
+def folded(cg: CompGraph, grouped: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Return groups of the functions that are in none: stretches of the way that the data takes.
+
+    They are cut from an order in which each function follows what it depends on, so no two depend on each other, and
+    branches come one after the other: where a branch ends, else where few tokens go from one to the next.
+    """
+    makers = {
+        name: {cg.digraph.producer[token] for token in cg.func_inputs(name) if token in cg.digraph.producer}
+        for name in cg.functions
+    }
+    order = [name for name in _depth_first(cg, makers) if name not in grouped]
+    place = {name: index for index, name in enumerate(order)}
+    # By place, how many tokens go from what is before it to it and what is after it.
+    changes = [0] * (len(order) + 2)
+    for token, maker in cg.digraph.producer.items():
+        last = max((place.get(name, 0) for name in cg.digraph.consumers.get(token, ())), default=0)
+        if place.get(maker, last) < last:
+            changes[place[maker] + 1] += 1
+            changes[last + 1] -= 1
+    passing = list(accumulate(changes))
+    usual, start, groups = max(2, -(-len(order) // _BOXES)), 0, dict[str, tuple[str, ...]]()
+
+    def badness(end: int) -> tuple[bool, int, int]:
+        return order[end - 1] in makers[order[end]], passing[end], abs(end - start - usual)
+
+    while start < len(order):
+        # The last stretch may be longer, rather than a short one more.
+        longest = usual + usual // 2
+        is_last = len(order) - start <= longest
+        end = len(order) if is_last else min(range(start + (usual + 1) // 2, start + longest + 1), key=badness)
+        if end - start > 1:
+            groups[f"{order[start]} … {order[end - 1]}"] = tuple(order[start:end])
+        start = end
+    return groups
+
+
+def _depth_first(cg: CompGraph, makers: dict[str, set[str]]) -> list[str]:
+    """Return the functions, each after all that it depends on, and as soon after the last of these as can be."""
+    left = {name: len(before) for name, before in makers.items()}
+    ready, order = [name for name in reversed(list(cg.functions)) if not left[name]], list[str]()
+    while ready:
+        name = ready.pop()
+        order.append(name)
+        takers = (taker for token in cg.func_outputs(name) for taker in cg.digraph.consumers.get(token, ()))
+        for taker in reversed(dict.fromkeys(takers)):
+            left[taker] -= 1
+            if not left[taker]:
+                ready.append(taker)
+    return order

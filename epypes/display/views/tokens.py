@@ -73,7 +73,7 @@ class _TokenPreview:
         self._range: Range | None = None
         self._reference: Callable[[], Any] = lambda: value
         self._revision = users_functions.revision
-        is_locked = self.is_image and _is_locked(value)
+        is_locked = self.is_image and is_locked_array(value)
         if is_locked:
             # A preview that is kept keeps no array.
             self._reference, self._range = ref(value), look.around.range_of(value)
@@ -94,7 +94,7 @@ class _TokenPreview:
         return made[0]
 
 
-def _is_locked(array: Any) -> bool:
+def is_locked_array(array: Any) -> bool:
     """Whether no part of an array can be written, through whatever array that has its memory."""
     while type(array) is np.ndarray:
         if array.flags.writeable:

@@ -21,7 +21,7 @@ from epypes.display.text import (
     short_name,
 )
 from epypes.display.views.graphview import Direction, FunctionView, GraphView, StageView, TokenState
-from epypes.display.views.groups import collapsed, groups_of, outside_tokens, twice_seen
+from epypes.display.views.groups import MOST_SHOWN, collapsed, folded, groups_of, outside_tokens, twice_seen
 from epypes.display.views.structure import structure_of
 from epypes.display.views.tokens import ROOM, HyperparameterValues, Room, token_views
 from epypes.errors import UnknownName, run_call
@@ -67,6 +67,9 @@ def view(
     _require_options(direction, thumbnails, collapse)
     cg = _graph_of(shown)
     groups = groups_of(cg.functions, cg.groups)
+    grouped = {name for inside in groups.values() for name in inside}
+    if len(cg.functions) - len(grouped) + len(groups) > MOST_SHOWN:
+        groups |= folded(cg, grouped)
     opened = names_of("open", open)
     for name in opened:
         if name not in groups:

@@ -27,13 +27,13 @@ from epypes.service.http import graph_routes, models, server_sent_events
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
 from epypes.service.http.responses import add_error_handlers, json_response, parameters_body
-from epypes.service.http.security import NEEDS_TOKEN
+from epypes.service.http.security import NEEDS_ACCESS_KEY
 
 _DESCRIPTION: Final = """
 Watches and controls a running service of EPypes.
 
-Reading needs no access token. Changes need that of the service, as `Authorization: Bearer TOKEN`; `epypes serve` names
-the file that holds it. A refusal says in `detail` what is wrong, and the way out.
+Reading needs no access key. Changes need that of the service, as `Authorization: Bearer ACCESS_KEY`; `epypes serve`
+prints it, and names the file that holds it. A refusal says in `detail` what is wrong, and the way out.
 """
 _TAGS: Final = [
     {"name": "health", "description": "For monitoring."},
@@ -51,7 +51,7 @@ _NON_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity"
 health = APIRouter(tags=["health"])
 parameters = APIRouter(tags=["parameters"])
 failures = APIRouter(prefix="/v1/failures", tags=["failures"])
-operation = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
+operation = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_ACCESS_KEY])
 
 
 def create_app(service: Service, lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
@@ -146,7 +146,7 @@ def read_parameters(service: ServiceOf) -> Response:
 @parameters.patch(
     "/v1/parameters",
     response_model=models.Parameters,
-    dependencies=[NEEDS_TOKEN],
+    dependencies=[NEEDS_ACCESS_KEY],
     responses={
         **CHANGE_REFUSALS,
         409: refused("They were changed concurrently; nothing is changed now.", models.Conflict),
@@ -163,7 +163,7 @@ def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
 @parameters.post(
     "/v1/parameters/write-back",
     response_model=WriteBack,
-    dependencies=[NEEDS_TOKEN],
+    dependencies=[NEEDS_ACCESS_KEY],
     responses={
         **CHANGE_REFUSALS,
         422: refused("The bundle can't be written.", models.Invalid),
@@ -235,7 +235,7 @@ _DEPLOY_REFUSALS: Final[Responses] = CHANGE_REFUSALS | {
 
 @operation.post("/access", response_model=models.Access, responses=CHANGE_REFUSALS)
 async def access() -> Response:
-    """Say whether the token is the service's, and change nothing."""
+    """Say whether the access key is the service's, and change nothing."""
     return json_response({"allowed": True})
 
 

@@ -189,7 +189,7 @@ class Failures(BaseModel):
 
 
 class Access(BaseModel):
-    """Whether changes are allowed; without the token the request is refused."""
+    """Whether changes are allowed; without the access key the request is refused."""
 
     allowed: bool
 
@@ -248,8 +248,8 @@ REFUSALS: Final[Responses] = {
     },
 }
 CHANGE_REFUSALS: Final[Responses] = REFUSALS | {
-    401: refused("The token is missing."),
-    403: refused("This is not the service's access token."),
+    401: refused("The access key is missing."),
+    403: refused("This is not the service's access key."),
 }
 INVALID: Final = refused("The request is not as described here.")
 # FastAPI would put a model into the media type of the events.

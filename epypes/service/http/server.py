@@ -149,9 +149,9 @@ class HttpServer:
         A ``Service``.
     address
         ``"127.0.0.1:8642"``, a port, or a URL; port 0 or ``*`` takes a free one.
-    token_file
-        Holds the token that changes need; it is made, readable by its owner alone, if it does not exist. Beside the
-        service's state file, if not given.
+    access_key_file
+        Holds the access key that changes need; it is made, readable by its owner alone, if it does not exist. Without
+        it, beside the service's state file.
     insecure
         Whether an address that other machines can reach may be taken; HTTP has no encryption.
     """
@@ -161,16 +161,16 @@ class HttpServer:
         service: Service,
         address: str,
         *,
-        token_file: str | Path | None = None,
+        access_key_file: str | Path | None = None,
         insecure: bool = False,
     ) -> None:
         self.address, self.insecure = address, insecure
         self.url = ""
         self._service = service
-        if token_file is None:
+        if access_key_file is None:
             info = service.info()
-            token_file = state_file(info["bundle"], info.get("replica", "")).with_suffix(".token")
-        self.token_file = Path(token_file)
+            access_key_file = state_file(info["bundle"], info.get("replica", "")).with_suffix(".access_key")
+        self.access_key_file = Path(access_key_file)
         self._server: uvicorn.Server | None = None
         self._app: FastAPI | None = None
         self._thread: threading.Thread | None = None
@@ -191,19 +191,19 @@ class HttpServer:
         AddressError
             The address can't be taken, or is not on loopback and not ``insecure``.
         KeysError
-            The token's file can't be used.
+            The access key's file can't be used.
         ServiceError
             The server did not start.
         """
-        from epypes.service.http.security import read_or_make_token
+        from epypes.service.http.security import read_or_make_access_key
 
-        token = read_or_make_token(self.token_file)
+        access_key = read_or_make_access_key(self.access_key_file)
         self._error = None
         self._started.clear()
         listener = _listen(self.address, self.insecure)
         try:
             self.url, hosts = _url_and_hosts(listener)
-            self._server = self._new_server(token, hosts)
+            self._server = self._new_server(access_key, hosts)
             self._thread = threading.Thread(target=self._run, args=(listener,), name="epypes-http", daemon=True)
             self._thread.start()
             if not self._started.wait(_START_TIMEOUT_S) or self._error is not None:
@@ -214,7 +214,7 @@ class HttpServer:
             raise
         return self.url
 
-    def _new_server(self, token: str, hosts: set[str]) -> uvicorn.Server:
+    def _new_server(self, access_key: str, hosts: set[str]) -> uvicorn.Server:
         import uvicorn
         from starlette.concurrency import run_in_threadpool
 
@@ -232,7 +232,7 @@ class HttpServer:
 
         self._app = create_app(self._service, lifespan)
         config = uvicorn.Config(
-            secured(self._app, token, self.token_file, hosts),
+            secured(self._app, access_key, self.access_key_file, hosts),
             http=_bounded_protocol(),
             ws="none",
             loop="asyncio",

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from epypes.service.remote.runner import RemoteRunner
     from epypes.wire import Envelope
 
-_TOKEN_VARIABLE: Final = "EPYPES_TOKEN"  # noqa: S105 - the name of a variable, not a secret
+# The second one is its former name.
+_VARIABLES: Final = ("EPYPES_ACCESS_KEY", "EPYPES_TOKEN")
 # A bundle is replayed in a process of its own before it is written or takes another one's place.
 _REPLAY_TIMEOUT_S: Final = 300.0
 _INFO_KEYS: Final = ("name", "digest", "state", "func_io", "outputs", "versions")
@@ -52,18 +53,20 @@ class Addresses:
     failures: str
 
 
-def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Connection:
+def connect(url: str, *, access_key: str | None = None, timeout_s: float = 5.0, token: str | None = None) -> Connection:
     """Connect to the HTTP control of a running service.
 
     Parameters
     ----------
     url
-        Its address, as ``http://127.0.0.1:8642``; the address of its page does too.
-    token
-        The access token. Without: that of the address, that of EPYPES_TOKEN, or, for a service of this user on
-        this machine, the one in its token file. Reading needs none.
+        Its address, as ``http://127.0.0.1:8642``, or the link to its page that ``epypes serve`` prints.
+    access_key
+        For changes; reading needs none. Without: that of the link, that of the environment variable EPYPES_ACCESS_KEY,
+        or, for a service of this user on this machine, the one in its file.
     timeout_s
         How long an answer may take, in seconds.
+    token
+        The former name of ``access_key``.
 
     Returns
     -------
@@ -75,18 +78,21 @@ def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Co
     ServiceError
         This is no address, nothing answers there, it is no EPypes service, or one of another version.
     """
-    address, token_in_url = split_url(url)
-    token = token or token_in_url or os.environ.get(_TOKEN_VARIABLE) or _token_on_this_machine(address)
-    return Connection(Control(address, token, timeout_s))
+    address, key_in_url = split_url(url)
+    in_environment = (os.environ.get(name) for name in _VARIABLES)
+    key = next(filter(None, (access_key, token, key_in_url, *in_environment)), "") or _key_on_this_machine(address)
+    return Connection(Control(address, key, timeout_s))
 
 
-def _token_on_this_machine(address: str) -> str:
-    """Return the token of a service of this user; empty if there is none."""
+def _key_on_this_machine(address: str) -> str:
+    """Return the access key of a service of this user; empty if there is none."""
     from epypes.service import state_file
 
     try:
         found = state_file.running_at(address)
-        return Path(found.token_file).read_text(encoding="ascii").strip() if found and found.token_file else ""
+        return (
+            Path(found.access_key_file).read_text(encoding="ascii").strip() if found and found.access_key_file else ""
+        )
     except (OSError, UnicodeDecodeError, ServiceError):
         return ""
 

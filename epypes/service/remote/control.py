@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -27,7 +28,7 @@ _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # A service sends its counts each second.
 _SILENCE_S: Final = 5.0
 _MAX_DETAIL_CHARACTERS: Final = 2_000
-_HOW_TO_CHANGE: Final = "Give it here: ep.connect(url, token=...), or set EPYPES_TOKEN."
+_HOW_TO_CHANGE: Final = "Give it here: ep.connect(url, access_key=...), or set EPYPES_ACCESS_KEY."
 
 Event = tuple[str, dict[str, Any]]
 
@@ -39,8 +40,8 @@ class Control:
     ----------
     url
         Its address, as ``http://127.0.0.1:8642``.
-    token
-        The access token; empty for none.
+    access_key
+        Empty for none.
     timeout_s
         How long an answer may take, in seconds.
 
@@ -50,9 +51,9 @@ class Control:
         This is no address.
     """
 
-    def __init__(self, url: str, token: str, timeout_s: float) -> None:
-        self.url, self.timeout_s, self._has_token = url, timeout_s, bool(token)
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
+    def __init__(self, url: str, access_key: str, timeout_s: float) -> None:
+        self.url, self.timeout_s, self._has_key = url, timeout_s, bool(access_key)
+        headers = {"Authorization": f"Bearer {access_key}"} if access_key else {}
         try:
             # A proxy of the environment does not reach this machine's loopback.
             is_here = urlsplit(url).hostname in _LOOPBACK
@@ -144,7 +145,7 @@ class Control:
             raise ParametersRefused(self.url, body["problems"])
         if "reasons" in body:
             raise DeployRefused(self.url, body["reasons"])
-        if response.status_code in (401, 403) and not self._has_token:
+        if response.status_code in (401, 403) and not self._has_key:
             raise ServiceError(self.url, f"{detail} {_HOW_TO_CHANGE}")
         if response.status_code == 409:
             raise NotComputed("", detail)
@@ -154,7 +155,7 @@ class Control:
 
 
 def split_url(url: str) -> tuple[str, str]:
-    """Return the address of a service without what its page's address has behind it, and the token that was there.
+    """Return the address of a service without what its page's address has behind it, and the access key in that.
 
     Raises
     ------
@@ -167,10 +168,13 @@ def split_url(url: str) -> tuple[str, str]:
     except (ValueError, AttributeError):
         is_address = False
     if not is_address:
-        text = f"{url!r:.200} is no address of a service. Write it as http://127.0.0.1:8642."
-        raise ServiceError(url, text)
-    token = parse_qs(parts.fragment).get("token", [""])[0]
-    return f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}", token
+        # Not what is behind a mark, which may be the key.
+        shown = re.split("[?#]", url)[0] if isinstance(url, str) else url
+        text = f"{shown!r:.200} is no address of a service. Write it as http://127.0.0.1:8642."
+        raise ServiceError(shown, text)
+    # It was printed as #token=... once.
+    found = parse_qs(parts.query).get("access_key") or parse_qs(parts.fragment).get("token") or [""]
+    return f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}", found[0]
 
 
 def read_parameters(url: str, body: Any) -> Parameters:

@@ -20,6 +20,7 @@ from epypes.run import CompGraphRunner, Run
 from epypes.service.frame_socket import FrameSocket, WorkerMessage
 from epypes.service.packing import BytesLike, pack
 from epypes.wire import Envelope, encode
+from epypes.wording import error_message
 
 if TYPE_CHECKING:
     from epypes.display import Figure, Preview
@@ -244,5 +245,5 @@ def _refusal(error: BaseException) -> dict[str, Any]:
         return {"error": str(error), "reason": error.reason}
     reasons: tuple[tuple[type, str], ...] = ((UnknownName, "unknown token"), (NotComputed, "not computed"))
     reason = next((key for kind, key in reasons if isinstance(error, kind)), "failed")
-    text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error!s:.500}"
+    text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error_message(error):.500}"
     return {"error": text, "reason": reason}

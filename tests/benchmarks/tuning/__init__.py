@@ -17,9 +17,11 @@ def missing() -> str:
 
 
 def rows(effort: Effort) -> list[Row]:
+    from tests.benchmarks.tuning import hover
     from tests.benchmarks.tuning.goals import compared
     from tests.benchmarks.tuning.session import measured
 
     if missing():
         return []
-    return [row for plain in (True, False) for row in compared(measured(effort, plain=plain))]
+    sliders = [row for plain in (True, False) for row in compared(measured(effort, plain=plain))]
+    return sliders + hover.rows(effort)

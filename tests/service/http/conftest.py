@@ -32,8 +32,8 @@ def service(edge_bundle, photograph, tmp_path_factory):
 @pytest.fixture(scope="module")
 def http(service, tmp_path_factory):
     """The control of a service, with its token as ``token``."""
-    with HttpServer(service, "127.0.0.1:*", token_file=tmp_path_factory.mktemp("token") / "token") as server:
-        server.token = server.token_file.read_text().strip()
+    with HttpServer(service, "127.0.0.1:*", access_key_file=tmp_path_factory.mktemp("token") / "token") as server:
+        server.token = server.access_key_file.read_text().strip()
         yield server
 
 

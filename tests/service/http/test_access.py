@@ -17,8 +17,8 @@ from tests.service.http.raw import request
 
 def token_of(service, path):
     """Return the token of a server that is started with a token file."""
-    with HttpServer(service, "127.0.0.1:*", token_file=path) as server:
-        return server.token_file.read_text().strip()
+    with HttpServer(service, "127.0.0.1:*", access_key_file=path) as server:
+        return server.access_key_file.read_text().strip()
 
 
 def test_a_token_is_made_once_and_only_its_owner_can_read_it(service, tmp_path):

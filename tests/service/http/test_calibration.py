@@ -74,8 +74,8 @@ def test_a_running_service_uses_it_and_shows_it_read_only(bundle, tmp_path):
     with (
         Service(bundle.path) as service,
         peer_of(service) as peer,
-        HttpServer(service, "127.0.0.1:*", token_file=tmp_path / "token") as server,
-        ep.connect(server.url, token=server.token_file.read_text().strip()) as connection,
+        HttpServer(service, "127.0.0.1:*", access_key_file=tmp_path / "token") as server,
+        ep.connect(server.url, token=server.access_key_file.read_text().strip()) as connection,
     ):
         peer.requests.put(Envelope(type="x", parts={"image": IMAGE}))
         assert np.array_equal(peer.take()[0].parts["scaled"], cv2.remap(IMAGE, *MAPS, cv2.INTER_LINEAR) * 2)

@@ -114,7 +114,7 @@ def test_pause_and_resume_say_what_they_did(changing):
 def test_parameters_are_written_back_after_a_look_at_what_would_change(edge_bundle, tmp_path):
     folder = shutil.copytree(edge_bundle.path, tmp_path / "edges")
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
-        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        headers = {"Authorization": f"Bearer {http.access_key_file.read_text().strip()}"}
         with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
             client.patch("/v1/parameters", json={"values": {"lo": 64}})
             would = client.post("/v1/parameters/write-back", json={"dry_run": True}).json()
@@ -146,8 +146,8 @@ def changed(edge_bundle, tmp_path):
 
 @pytest.fixture
 def epypes(epypes, monkeypatch, http):
-    """The commands, with the token of the service."""
-    monkeypatch.setenv("EPYPES_TOKEN", http.token)
+    """The commands, with the access key of the service."""
+    monkeypatch.setenv("EPYPES_ACCESS_KEY", http.token)
     return epypes
 
 
@@ -199,7 +199,15 @@ def test_without_a_service_or_its_token_nothing_is_deployed(epypes, http, edge_b
     (tmp_path / "token").write_text("x" * 43)
     done = epypes("deploy", edge_bundle.path, "--http", http.url, "--token-file", tmp_path / "token")
     assert done.returncode == 1
-    assert "token" in done.stderr
+    assert "access key" in done.stderr
+    link = f"{http.url}/?access_key={'x' * 43}"
+    for arguments in (("deploy", edge_bundle.path, "--http", link), ("stop", link), ("failures", f"{link}#part")):
+        done = epypes(*arguments)
+        assert "xxx" not in done.stdout + done.stderr, arguments
+    assert f"{http.url}/?access_key=..." in epypes("stop", link).stderr
+    (tmp_path / "token").write_text(http.token)
+    done = epypes("deploy", tmp_path / "none", "--http", http.url, "--access-key-file", tmp_path / "token")
+    assert "is no folder" in done.stderr
 
 
 @pytest.mark.slow
@@ -212,7 +220,7 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
     )
     write_manifest(waiting)
     with Service(slow) as service, HttpServer(service, "127.0.0.1:*") as http:
-        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        headers = {"Authorization": f"Bearer {http.access_key_file.read_text().strip()}"}
         with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
             answers = []
             first = threading.Thread(

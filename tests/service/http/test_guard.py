@@ -42,7 +42,7 @@ def test_a_change_without_the_token_is_refused_and_says_where_it_is(client, http
     answer = client.request(method, path, json={})
     assert answer.status_code == 401
     assert answer.headers["www-authenticate"].startswith("Bearer")
-    assert str(http.token_file) in sentence(answer)
+    assert str(http.access_key_file) in sentence(answer)
 
 
 @pytest.mark.parametrize(("method", "path"), CHANGES)
@@ -51,7 +51,7 @@ def test_a_change_with_another_token_is_refused(client, http, method, path):
         headers = {"Authorization": given.format(token=http.token).encode()}
         answer = client.request(method, path, json={}, headers=headers)
         assert answer.status_code == 403
-        assert "not the service's access token" in sentence(answer)
+        assert "not the service's access key" in sentence(answer)
 
 
 def test_who_still_sends_a_body_has_the_refusal_of_its_token_all_the_same(http):

@@ -6,7 +6,7 @@ const FILTERS = { image: "none", gray: "grayscale(1)", blurred: "grayscale(1) bl
 const SIZE = { width: 512, height: 384 };
 const DEFAULTS = { crop: [60, 40, 200, 160], blur_kernel: 5, sigma: 1.5, canny_lo: 70, canny_hi: 200, border: "REFLECT" };
 const row = (css, names, kind, of, more) => ({
-  css: `epypes-row-${css}`, names, kind, function: of, model: `model-${css}`, integer: false, odd: false, log: false,
+  css: `epypes-row-${css}`, names, kind, functions: [of], model: `model-${css}`, integer: false, odd: false, log: false,
   low: names.map(() => 0), high: names.map(() => 255), step: names.map(() => 1), unit: "", tip: "",
   default: names.map((name) => DEFAULTS[name]), value: names.map((name) => DEFAULTS[name]), ...more,
 });
@@ -17,7 +17,7 @@ const ROWS = [
   row(3, ["border"], "choice", "blur", { low: [null], high: [null], step: [null] }),
   row(4, ["canny_lo", "canny_hi"], "range", "canny", { integer: true, tip: "Thresholds of the gradient." }),
 ];
-const FOLDERS = ["crop", "blur", "canny"].map((name, i) => ({ css: `epypes-folder-${i}`, function: name }));
+const FOLDERS = ["crop", "blur", "canny"].map((name, i) => ({ css: `epypes-folder-${i}`, functions: [name] }));
 
 /** A widget's model as the widget manager gives it. */
 function fakeModel(value, moved) {
@@ -99,8 +99,8 @@ function buildControls() {
   for (const folder of FOLDERS) {
     const box = document.createElement("div");
     box.className = `epypes-folder ${folder.css}`;
-    box.innerHTML = `<div class="epypes-heading"><div class="widget-html-content"><span class="epypes-name">${folder.function}</span><span class="epypes-time"></span></div></div>`;
-    for (const one of ROWS.filter((each) => each.function === folder.function)) {
+    box.innerHTML = `<div class="epypes-heading"><div class="widget-html-content"><span class="epypes-name">${folder.functions[0]}</span><span class="epypes-time"></span></div></div>`;
+    for (const one of ROWS.filter((each) => each.functions[0] === folder.functions[0])) {
       const node = document.createElement("div");
       node.className = `epypes-row ${one.css}`;
       node.innerHTML = `<div class="jupyter-widgets widget-inline-hbox"><label class="widget-label">${one.names.join(" ")}</label><div class="slider-container"></div></div>`;
@@ -280,7 +280,7 @@ const model = {
     kernel.sent.push(structuredClone(content));
     if (!kernel.isQuiet) setTimeout(() => answers[content.kind]?.(content));
   },
-  on: (_, listener) => kernel.listeners.add(listener),
+  on: (event, listener) => event === "msg:custom" && kernel.listeners.add(listener),
   off: (_, listener) => kernel.listeners.delete(listener),
   get: () => undefined,
   widget_manager: { get_model: async (id) => kernel.models[id] },

@@ -16,9 +16,9 @@ test("a long value is cut", () => assert.equal(shortly("a".repeat(99)).length, 4
 
 test("what is typed is read exactly", () => assert.deepEqual(read(row(), 0, " 1.61234 "), { value: 1.61234 }));
 test("an exponent is a number", () => assert.deepEqual(read(row(), 0, "1e-3"), { value: 0.001 }));
-test("a word is none", () => assert.match(read(row(), 0, "much").problem, /x: much is no number/));
-test("nothing is none", () => assert.match(read(row(), 0, "").problem, /no number/));
-test("infinity is none", () => assert.match(read(row(), 0, "Infinity").problem, /no number/));
+test("a word is none", () => assert.match(read(row(), 0, "much").problem, /Type a number for x, not much\./));
+test("nothing is none", () => assert.match(read(row(), 0, "").problem, /Type a number for x\./));
+test("infinity is none", () => assert.match(read(row(), 0, "Infinity").problem, /Type a number/));
 test("a fraction is no whole number", () => assert.match(read(odd, 0, "2.5").problem, /whole numbers/));
 test("the ends are told", () => assert.match(read(row(), 0, "11").problem, /its range is 0 to 10/));
 test("an open end is not told", () => assert.match(read(row({ high: [null] }), 0, "-1").problem, /at least 0/));

@@ -6,7 +6,7 @@ twice or in another order than they were sent.
 - To the view: ``setup`` (what there is: rows, folders, stages, images), ``frame`` (pictures, with their bytes),
   ``reference`` (a picture to compare with), ``error``, ``note`` (a sentence that is no error), ``latency``,
   ``history``, ``cases`` (which test images pass), ``probe``, ``settings``, ``promoted``, ``written``, ``optimised``,
-  ``log``.
+  ``log``, ``pong`` (the answer to ``ping``).
 - To the kernel: ``ready`` and ``closed`` (a view is mounted or removed), ``painted`` (a frame has come, and the one
   before is on the screen; what was moved meanwhile goes with it), and what ``messages`` handles.
 """

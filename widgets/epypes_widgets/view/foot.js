@@ -4,15 +4,13 @@ import { answer, element, iconButton, note, say, textButton } from "./elements.j
 const COPIED_MS = 1500;
 const DIFF_LINES = [["---", "epypes-diff-file"], ["+++", "epypes-diff-file"], ["+", "epypes-added"], ["-", "epypes-removed"]];
 
-const outcome = (name = "epypes-outcome") => element("span", `epypes-message ${name}`, { role: "status" });
-const line = (status, ...asking) => element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, ...asking), status);
+const line = (...asking) => element("div", "epypes-foot-line epypes-with", {}, ...asking);
 
-function settingsLine(panel) {
+function settingsLine(panel, status) {
   const list = element("datalist", "", { id: `epypes-settings-${Math.random().toString(36).slice(2)}` });
   const name = element("input", "epypes-input epypes-setting", { type: "text", "aria-label": "Name of the settings", placeholder: "name of settings", list: list.id, spellcheck: "false" });
   const save = textButton("Save", () => onSetting("save"), "epypes-save", "Save the values as a TOML file");
   const load = textButton("Load", () => onSetting("load"), "epypes-load", "Load saved values");
-  const status = outcome("epypes-setting-message");
 
   function onSetting(kind) {
     const asked = name.value.trim();
@@ -22,16 +20,15 @@ function settingsLine(panel) {
 
   name.addEventListener("keydown", (event) => event.key === "Enter" && onSetting("save"));
   return {
-    line: line(status, list, name, save, load),
+    line: line(list, name, save, load),
     offer: (names) => list.replaceChildren(...names.map((one) => element("option", "", { value: one }))),
     tell: (text, isGood) => answer(status, text, isGood),
   };
 }
 
-function promoteLine(panel) {
+function promoteLine(panel, status) {
   const to = element("input", "epypes-input epypes-target", { type: "text", "aria-label": "Promote to", placeholder: "folder", spellcheck: "false" });
   const promote = textButton("Promote", onPromote, "epypes-promote", "Write the graph with these values as a folder of plain text, and check it");
-  const status = outcome();
 
   function onPromote() {
     promote.disabled = true;
@@ -41,7 +38,7 @@ function promoteLine(panel) {
 
   to.addEventListener("keydown", (event) => event.key === "Enter" && !promote.disabled && onPromote());
   return {
-    line: line(status, to, promote),
+    line: line(to, promote),
     propose: (folder) => (to.value ||= folder),
     show({ state, text }) {
       promote.disabled = state === "running";
@@ -51,11 +48,10 @@ function promoteLine(panel) {
 }
 
 /** In the place of promoting for a service: first what would change in its bundle, then the change. */
-function writeBackLine(panel) {
+function writeBackLine(panel, status) {
   const ask = textButton("Write back", () => onAsk(true), "epypes-write-back", "Show what these values would change in pipeline.toml");
   const write = textButton("Write", () => onAsk(false), "epypes-write", "Write it, replay the samples, and seal the bundle anew");
   const cancel = textButton("Cancel", () => show({ state: "", text: "" }), "epypes-cancel");
-  const status = outcome();
   const diff = element("pre", "epypes-diff", { tabindex: "0", role: "region", "aria-label": "What changes in pipeline.toml", hidden: "" });
   const disable = (on) => [ask, write, cancel].forEach((button) => (button.disabled = on));
 
@@ -77,16 +73,17 @@ function writeBackLine(panel) {
   }
 
   show({ state: "", text: "" });
-  return { line: line(status, ask, write, cancel), diff, show };
+  return { line: line(ask, write, cancel), diff, show };
 }
 
 export function footPart(panel) {
   const code = element("code", "epypes-code");
   const copied = element("span", "epypes-copied", { role: "status" });
   const copyButton = iconButton("copy", "Copy the line of code", onCopy, "epypes-copy");
-  const settings = settingsLine(panel);
-  const promoting = promoteLine(panel);
-  const back = writeBackLine(panel);
+  const status = element("div", "epypes-message epypes-outcome", { role: "status" });
+  const settings = settingsLine(panel, status);
+  const promoting = promoteLine(panel, status);
+  const back = writeBackLine(panel, status);
   const [summary, lines] = [element("summary"), element("ol", "epypes-lines")];
   const log = element("details", "epypes-log", { hidden: "" }, summary, lines);
   const codeLine = element("div", "epypes-foot-line epypes-code-line", {}, code, copied, copyButton);
@@ -104,7 +101,7 @@ export function footPart(panel) {
   }
 
   return {
-    element: element("div", "epypes-foot", {}, codeLine, settings.line, promoting.line, back.line, back.diff, log),
+    element: element("div", "epypes-foot", {}, codeLine, settings.line, promoting.line, back.line, status, back.diff, log),
     /** The lines that ask the kernel for something; the code can be copied and the log read without it. */
     asking: [settings.line, promoting.line, back.line],
     setup(message) {

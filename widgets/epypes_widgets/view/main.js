@@ -6,6 +6,7 @@ import { announced, element, note, say } from "./elements.js";
 import { footPart } from "./foot.js";
 import { clear, failures, framesPart } from "./frames.js";
 import { histogramPart } from "./histogram.js";
+import { watchKernel } from "./kernel.js";
 import { inMs } from "./numbers.js";
 import { optimisePart } from "./optimise.js";
 import { overlayCount } from "./overlay.js";
@@ -13,6 +14,7 @@ import { probePart } from "./probe.js";
 import { outbox } from "./protocol.js";
 import { roiPart } from "./roi.js";
 import { rowsPart } from "./rows.js";
+import { sizePart } from "./size.js";
 import { stagePart } from "./stage.js";
 import { filmsPart, historyPart, pinnedPart, videoPart } from "./strips.js";
 
@@ -25,6 +27,7 @@ function headerPart() {
   const [token, kind, marks, count, times] = ["epypes-token", "epypes-kind", "epypes-marks", "epypes-count", "epypes-times"].map((name) => element("span", name));
   const badge = element("span", "epypes-badge", {}, "stale");
   const status = element("div", "epypes-status", { role: "status", "aria-live": "polite" });
+  const root = element("figcaption", "epypes-header", {}, token, kind, badge, marks, count, times);
   let noted = "";
   let failed = "";
   let passes = false;
@@ -38,12 +41,14 @@ function headerPart() {
   }
 
   return {
-    element: element("figcaption", "epypes-header", {}, token, kind, badge, marks, count, times),
-    status,
+    element: root,
+    // A long text covers what is below rather than move it.
+    status: element("div", "epypes-status-place", {}, status),
     frame({ frame, main }) {
       if (passes) noted = "";
       show();
       say(token, frame.token);
+      note(token, "title", frame.token);
       say(kind, main.shape ? `${main.dtype} ${main.shape} ${main.order ?? ""}`.trim() : "");
       say(marks, overlayCount(main.overlay));
       say(count, `${frame.ran} ran, ${frame.reused} reused${frame.skipped ? `, ${frame.skipped} skipped` : ""}`);
@@ -69,15 +74,18 @@ function headerPart() {
 function render({ model, el }) {
   const figure = element("figure", "epypes-view epypes-empty", { "data-lm-suppress-shortcuts": "true" });
   const closing = new AbortController();
-  const out = outbox((content) => model.send(content));
+  const kernel = watchKernel(model, el, { ended, late: (text) => header.tell(text, true), signal: closing.signal });
+  const out = outbox(kernel.send);
   const send = (content) => {
     if (GIVES_VALUES.includes(content.kind)) out.forget();
-    model.send(content);
+    kernel.send(content);
   };
   const failed = failures();
   let described = null;
   let shownFailure = null;
   let held = "";
+  /** The last message of what there is. */
+  let given = /** @type {any} */ (null);
   /** What the parts share. */
   const panel = {
     ...out,
@@ -116,6 +124,7 @@ function render({ model, el }) {
   let bar = /** @type {any} */ (null);
   const header = headerPart();
   const stage = stagePart();
+  const size = sizePart(figure, stage.box);
   const compare = (panel.compare = comparePart(panel, stage));
   const probe = probePart(panel, stage);
   const roi = roiPart(panel, stage);
@@ -134,9 +143,11 @@ function render({ model, el }) {
   const all = (method, ...given) => parts.forEach((part) => part[method]?.(...given));
   stage.panByDrags();
   bar.listen(figure, closing.signal);
+  header.element.append(size.wide);
+  // Save and Promote are on the screen together with the picture.
   figure.append(
-    bar.element, chips.element, header.element, stage.element, header.status,
-    video.element, histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element, foot.element,
+    bar.element, chips.element, header.element, stage.element, size.handle, header.status, video.element, foot.element,
+    histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element,
   );
   el.append(figure);
 
@@ -162,12 +173,24 @@ function render({ model, el }) {
 
   function setup(message, buffers) {
     answered();
+    given = { message, buffers };
     panel.state.token = message.token ?? "";
     all("setup", message, buffers);
     // What asks the kernel to compute rests with a panel that is closed; its picture can still be looked at.
     const column = figure.closest(".epypes-panel")?.querySelector(".epypes-controls");
     const asking = [column, chips.element, pinned.element, films.element, video.element, history.element, optimise.element, ...foot.asking];
     for (const node of asking) if (node) node.inert = Boolean(message.closed);
+  }
+
+  /** The kernel is gone: what is there can still be looked at, and the static output if that is nothing. */
+  function ended(text) {
+    answered();
+    figure.classList.add("epypes-ended");
+    figure.classList.toggle("epypes-void", stage.picture.hidden && stage.text.hidden);
+    if (given) setup({ ...given.message, closed: true }, given.buffers);
+    stage.wait("");
+    header.failure(null);
+    header.tell(text);
   }
 
   const handlers = {
@@ -186,19 +209,21 @@ function render({ model, el }) {
     },
   };
   for (const kind of PASSED_ON) handlers[kind] = (...given) => all(kind, ...given);
-  const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);
+  const onMessage = (message, buffers) => {
+    kernel.answered();
+    handlers[message.kind]?.(message, buffers ?? []);
+  };
   model.on("msg:custom", onMessage);
   const answered = announced(send);
   return () => {
     answered();
+    send({ kind: "closed" });
     closing.abort();
     model.off("msg:custom", onMessage);
     out.close();
     stage.close();
     [stage.picture, stage.other].forEach((img) => clear(img));
     figure.remove();
-    // Last: it raises if the kernel is gone.
-    send({ kind: "closed" });
   };
 }
 

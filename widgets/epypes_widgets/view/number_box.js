@@ -2,6 +2,8 @@
 import { element, note } from "./elements.js";
 import { FAST, means, read, same, stepped, written } from "./numbers.js";
 
+/** A box grows with what is in it from this many characters on. */
+const FITTING = 7;
 const NUMBER_KEYS = { ArrowUp: 1, ArrowDown: -1, PageUp: FAST, PageDown: -FAST };
 
 /**
@@ -11,7 +13,7 @@ const NUMBER_KEYS = { ArrowUp: 1, ArrowDown: -1, PageUp: FAST, PageDown: -FAST }
 export function numberBox(panel, row, index) {
   const name = row.names[index];
   const label = `${name}${row.unit ? ` in ${row.unit}` : ""}`;
-  const input = element("input", "epypes-number", { type: "number", step: "any", "aria-label": label, "data-name": name, title: row.tip });
+  const input = element("input", "epypes-number", { type: "text", inputmode: "decimal", autocomplete: "off", "aria-label": label, "data-name": name, title: row.tip });
   let position = row.value[index];
   let exact = position;
   let isTyping = false;
@@ -23,6 +25,11 @@ export function numberBox(panel, row, index) {
     if (isTyping) return;
     const text = typeof current() === "number" ? written(current()) : "";
     if (input.value !== text) input.value = text;
+    fit();
+  }
+
+  function fit() {
+    input.style.width = input.value.length > FITTING ? `calc(${input.value.length}ch + 14px)` : "";
   }
 
   function complain(problem) {
@@ -49,7 +56,7 @@ export function numberBox(panel, row, index) {
   /** Take what was typed; it stays, marked, if it can't be taken. */
   function commit() {
     if (!isTyping) return;
-    const found = read(row, index, input.validity.badInput ? "what was typed" : input.value, values());
+    const found = read(row, index, input.value, values());
     if ("problem" in found) complain(found.problem);
     else place(found.value, true);
   }
@@ -69,13 +76,15 @@ export function numberBox(panel, row, index) {
     event.stopPropagation();
   }
 
-  input.addEventListener("input", () => (isTyping = true));
+  input.addEventListener("input", () => {
+    isTyping = true;
+    fit();
+  });
   input.addEventListener("change", commit);
   input.addEventListener("blur", () => {
     commit();
     panel.commit();
   });
-  input.addEventListener("wheel", (event) => document.activeElement === input && event.preventDefault(), { passive: false });
   input.addEventListener("keydown", onKey);
   show();
 

@@ -3,6 +3,9 @@
 /** How many steps a key with Shift takes. */
 export const FAST = 10;
 
+/** What stands before the decimals where the browser's user lives. */
+const DECIMAL = new Intl.NumberFormat().formatToParts(1.5).find(({ type }) => type === "decimal")?.value ?? ".";
+
 /** @typedef {{integer?: boolean, odd?: boolean, log?: boolean, low: (number | null)[], high: (number | null)[],
  *             step: (number | null)[], names: string[]}} NumberRow */
 
@@ -62,8 +65,8 @@ export function clamped(row, index, value, values) {
 export function read(row, index, text, values) {
   const name = row.names[index];
   const typed = text.trim();
-  const value = Number(typed);
-  if (typed === "" || !Number.isFinite(value)) return { problem: `${name}: ${typed || "nothing"} is no number.` };
+  const value = Number(typed.replace(DECIMAL, "."));
+  if (typed === "" || !Number.isFinite(value)) return { problem: `Type a number for ${name}${typed ? `, not ${typed}` : ""}.` };
   if ((row.integer || row.odd) && !Number.isInteger(value)) return { problem: `${name} takes whole numbers, not ${typed}.` };
   const { low, high } = ends(row, index, values);
   const asked = row.odd ? asKind(row, value) : value;

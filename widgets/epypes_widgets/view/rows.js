@@ -5,6 +5,9 @@ import { inMs, modelValue, same, shortly, shownAt } from "./numbers.js";
 
 const NUMERIC = ["slider", "range", "log"];
 
+/** A name in parts, after each of which a line may break. */
+const breakable = (name) => name.split(/(?<=_)/).flatMap((part) => [part, element("wbr")]);
+
 /** Decorates the rows of the panel that this view is in until the signal; they may come later than the view. */
 export function rowsPart(panel, figure, signal) {
   let rows = [];
@@ -55,9 +58,11 @@ export function rowsPart(panel, figure, signal) {
     const label = `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`;
     const reset = iconButton("reset", label, () => panel.send({ kind: "reset", names: row.names }), "epypes-reset");
     const added = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
-    boxes.forEach(({ input }, index) => added.append(...(index ? ["–"] : []), input));
-    // Without a unit, too: the boxes stand below each other.
-    if (boxes.length || row.unit) added.append(element("span", "epypes-unit", {}, row.unit));
+    for (const { input, name } of boxes) added.append(element("span", "epypes-label", {}, ...breakable(name)), input, element("span", "epypes-unit", {}, row.unit));
+    if (!boxes.length) {
+      node.querySelector(".widget-label:not(:empty)")?.replaceChildren(...row.names.flatMap(breakable));
+      if (row.unit) added.append(element("span", "epypes-unit", {}, row.unit));
+    }
     if (row.kind === "roi") added.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi()));
     if (row.kind !== "shown") added.append(reset);
     added.append(sign);
@@ -72,11 +77,12 @@ export function rowsPart(panel, figure, signal) {
       });
       const isAtFault = row.names.some((name) => failed?.names?.includes(name));
       node.classList.toggle("epypes-changed", isChanged);
-      reset.disabled = !isChanged;
+      // What a row without boxes stands at is not known here while it fails.
+      reset.disabled = !isChanged && !isAtFault;
       node.classList.toggle("epypes-failed", isAtFault);
       say(sign, isAtFault ? "!" : "");
       if (isAtFault) note(sign, "aria-label", failed.text);
-      note(node, "title", isAtFault ? failed.text : row.tip);
+      note(node, "title", isAtFault ? failed.text : [row.names.join(", "), row.tip].filter(Boolean).join("\n"));
     }
     return { node, added, boxes, update };
   }
@@ -96,14 +102,15 @@ export function rowsPart(panel, figure, signal) {
       fold();
     }, { signal });
 
-    /** Show how long the function took, and whether it failed. */
+    /** Show how long the functions took, and whether one of them failed. */
     function update() {
-      const ms = last?.times_ms?.[folder.function];
-      if (ms !== undefined) say(heading.querySelector(".epypes-time"), inMs(ms));
-      const isAtFault = failed?.function === folder.function;
+      const times = folder.functions.map((name) => last?.times_ms?.[name] ?? NaN);
+      const ms = times.reduce((sum, each) => sum + each, 0);
+      if (last && Number.isFinite(ms)) say(heading.querySelector(".epypes-time"), inMs(ms));
+      const isAtFault = folder.functions.includes(failed?.function);
       heading.classList.toggle("epypes-failed", isAtFault);
       say(added, isAtFault ? "! failed" : "");
-      note(heading, "title", isAtFault ? failed.text : "");
+      note(heading, "title", isAtFault ? failed.text : folder.functions.join(", "));
     }
     return { node, added, update };
   }
@@ -134,7 +141,7 @@ export function rowsPart(panel, figure, signal) {
     const words = asked.split(/\s+/).filter(Boolean);
     let matches = 0;
     for (const row of rows) {
-      const text = [...row.names, row.function, row.tip, row.unit].join(" ").toLowerCase();
+      const text = [...row.names, ...row.functions, row.tip, row.unit].join(" ").toLowerCase();
       const isMatch = words.every((word) => text.includes(word));
       matches += Number(isMatch);
       found.get(row)?.node.classList.toggle("epypes-unmatched", !isMatch);

@@ -2,6 +2,7 @@
 import { button, element, fill, iconButton, keep, note, say, walkAlong } from "./elements.js";
 import { FRAME } from "./protocol.js";
 
+const ONE_CHANGE = /^(\S+) ([^,]+ -> [^,]+)$/;
 const VERDICTS = { passed: "✓ pass", failed: "✗ fail", waiting: "… waits" };
 
 function strip(name, label) {
@@ -164,11 +165,19 @@ export function historyPart(panel) {
   /** By number of its entry; the kernel sends a thumbnail once. */
   let images = new Map();
 
+  /** The name of a single change is cut rather than its values. */
+  function caption(name, text) {
+    const [, changed, values] = ONE_CHANGE.exec(text) ?? [];
+    const title = element("b", "", {}, name);
+    return changed ? [element("span", "epypes-name", {}, title, ` ${changed}`), ` ${values}`] : [title, ` ${text}`];
+  }
+
   function make(entry, bytes) {
     const name = entry.label || `#${entry.number}`;
     const text = entry.changed || "start";
-    const attributes = { "data-number": entry.number, "aria-label": `Go to ${name}: ${text}`, title: `${name}: ${text}`, "aria-current": Boolean(entry.current) };
-    const { img, node } = small(attributes, () => panel.send({ kind: "goto", number: entry.number }), element("b", "", {}, name), ` ${text}`);
+    const whole = `${name}: ${entry.about || text}`;
+    const attributes = { "data-number": entry.number, "aria-label": `Go to ${whole}`, title: whole, "aria-current": Boolean(entry.current) };
+    const { img, node } = small(attributes, () => panel.send({ kind: "goto", number: entry.number }), ...caption(name, text));
     const shown = images.get(entry.number) ?? img;
     img.replaceWith(shown);
     if (bytes?.byteLength) fill(shown, bytes);

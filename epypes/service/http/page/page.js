@@ -4,7 +4,7 @@ import { redraw, sawPlace, watchGraph } from "./graph.js";
 import { sawParameters, showButtons, watchParameters } from "./parameters.js";
 import { sawCounts, sawRun } from "./rates.js";
 import { sawGroup } from "./replicas.js";
-import { ask, confirmed, entries, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
+import { ask, confirmed, entries, hasKey, hear, keepKey, make, part, Refused, requireKey, say, takeKey } from "./server.js";
 
 const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error", LOST: "error" };
 /** The states in which each operation makes sense. */
@@ -46,7 +46,11 @@ async function loadInfo() {
 }
 
 function showOperations() {
-  for (const [name, states] of Object.entries(OPERATIONS)) part(name).disabled = !hasToken() || !states.includes(state);
+  const names = Object.keys(OPERATIONS);
+  const wrong = names.filter((name) => !OPERATIONS[name].includes(state));
+  for (const name of names) part(name).disabled = !hasKey() || wrong.includes(name);
+  const labels = wrong.map((name) => part(name).textContent.replace("…", "")).join(", ");
+  part("operation-why").textContent = !hasKey() ? "These need the access key." : wrong.length ? `${labels}: not while ${state || "connecting"}.` : "";
 }
 
 async function operate(path, body = undefined) {
@@ -55,7 +59,7 @@ async function operate(path, body = undefined) {
     say("notice", "");
   } catch (error) {
     say("notice", error.message);
-    if (error instanceof Refused && error.status === 403) refuseToken();
+    if (error instanceof Refused && error.status === 403) refuseKey();
   }
 }
 
@@ -64,32 +68,32 @@ async function drain() {
   if (await confirmed("Drain the service?", text, "Drain")) await operate("v1/drain", {});
 }
 
-function refuseToken() {
-  keepToken("");
-  showToken();
-  say("notice", "This is not the service's access token. It is in the file that epypes serve names.");
+function refuseKey() {
+  keepKey("");
+  showKey();
+  say("notice", "This is not the service's access key. Open the link that epypes serve printed, or read the key in the file that it named.");
 }
 
-/** Take an access token only if the service knows it. */
-async function useToken(given) {
-  keepToken(given);
+/** Take an access key only if it is that of the service. */
+async function useKey(given) {
+  keepKey(given);
   try {
-    if (given) await isTokenKnown();
+    if (given) await requireKey();
     say("notice", "");
-    showToken();
+    showKey();
   } catch (error) {
-    if (error instanceof Refused && [401, 403].includes(error.status)) return refuseToken();
-    keepToken("");
-    showToken();
+    if (error instanceof Refused && [401, 403].includes(error.status)) return refuseKey();
+    keepKey("");
+    showKey();
     say("notice", error.message);
   }
 }
 
-function showToken() {
-  const [form, isTaken] = [part("token-form"), hasToken()];
-  part("token-hint").textContent = isTaken ? "The access token is right: changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
-  form.querySelector("button").textContent = isTaken ? "Forget" : "Use";
-  part("token").hidden = form.querySelector("label").hidden = isTaken;
+function showKey() {
+  const [form, isTaken] = [part("access-key-form"), hasKey()];
+  part("access-key-hint").textContent = isTaken ? "The access key is right: changes are allowed in this tab." : "It is in the link that epypes serve printed, and in the file that it named. This tab keeps it until it is closed.";
+  form.querySelector("button").textContent = isTaken ? "Forget the access key" : "Use";
+  part("access-key").hidden = form.querySelector("label").hidden = isTaken;
   showOperations();
   showButtons();
 }
@@ -106,19 +110,19 @@ function onHeard(isHeard) {
 }
 
 const takeGiven = () => {
-  const given = takeToken();
-  if (given) void useToken(given);
+  const given = takeKey();
+  if (given) void useKey(given);
 };
 watchGraph();
 watchParameters();
-showToken();
+showKey();
 takeGiven();
 addEventListener("hashchange", takeGiven);
-part("token-form").addEventListener("submit", (event) => {
+part("access-key-form").addEventListener("submit", (event) => {
   event.preventDefault();
-  const given = hasToken() ? "" : part("token").value;
-  part("token").value = "";
-  void useToken(given);
+  const given = hasKey() ? "" : part("access-key").value;
+  part("access-key").value = "";
+  void useKey(given);
 });
 part("pause").addEventListener("click", () => void operate("v1/pause"));
 part("resume").addEventListener("click", () => void operate("v1/resume"));

@@ -1,5 +1,5 @@
 // The fields of the parameters: what the service has, and what is changed here.
-import { ask, confirmed, hasToken, make, part, say } from "./server.js";
+import { ask, confirmed, hasKey, make, part, say } from "./server.js";
 
 const STEPS = 200;
 
@@ -42,13 +42,18 @@ export function sawParameters(now) {
   }
 }
 
-/** Show which buttons can be used. */
+/** Show which buttons can be used, and why the others can't. */
 export function showButtons() {
   const count = changes().size;
-  part("apply").disabled = !count || !hasToken();
+  part("apply").disabled = !count || !hasKey();
   part("undo").disabled = !count;
-  part("write-back").disabled = !hasToken() || count > 0;
+  part("write-back").disabled = !hasKey() || count > 0;
   part("apply").textContent = count ? `Apply ${count}` : "Apply";
+  const why = [];
+  if (!count) why.push("Apply and Undo: nothing is changed here.");
+  else if (hasKey()) why.push("Write back: apply or undo the changes first.");
+  if (!hasKey()) why.push(count ? "Apply and Write back need the access key." : "Write back needs the access key.");
+  part("parameters-why").textContent = why.join(" ");
 }
 
 /** What was changed here, by token. */
@@ -82,7 +87,7 @@ function refuse(error, wanted, before) {
     sawParameters(error.data);
     // They may have been told of before the refusal came.
     const theirs = [...values()].filter(([token, value]) => !same(before.get(token), value)).map(([token, value]) => `${token}: ${text(before.get(token))} → ${text(value)}`);
-    say("parameters-note", `Somebody else changed the parameters meanwhile, so nothing was applied. They are loaded anew (${theirs.join("; ")}). Yours are marked; apply again to use them.`, false);
+    say("parameters-note", `Another client changed the parameters meanwhile, so nothing was applied. They are loaded anew (${theirs.join("; ")}). Yours are marked; apply again to use them.`, false);
     return;
   }
   say("parameters-note", error.message);

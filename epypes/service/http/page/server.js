@@ -1,6 +1,6 @@
 // Requests to the service, its stream of events, and what all parts of the page are made with.
 
-const TOKEN = "epypes-token";
+const KEY = "epypes-access-key";
 const AGAIN_MS = 2000;
 
 /** What the service refused: a sentence, the status (0 if there was no answer), and what came with it. */
@@ -13,22 +13,26 @@ export class Refused extends Error {
   }
 }
 
-/** Return the token that is in the address, where `epypes serve` prints it, and hide it there. */
-export function takeToken() {
-  const given = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (given) history.replaceState(null, "", location.pathname + location.search);
+/** Return the access key of the link that `epypes serve` prints, and take it out of the address bar and the history. */
+export function takeKey() {
+  const query = new URLSearchParams(location.search);
+  // It was printed as #token=... once.
+  const given = query.get("access_key") || new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!given) return null;
+  query.delete("access_key");
+  history.replaceState(null, "", location.pathname + (query.size ? `?${query}` : ""));
   return given;
 }
 
-/** Throws Refused if the service does not know the token. */
-export const isTokenKnown = () => ask("v1/access", "POST", {});
+/** Throws Refused if it is not the access key of the service. */
+export const requireKey = () => ask("v1/access", "POST", {});
 
-export function keepToken(token) {
-  if (token) sessionStorage.setItem(TOKEN, token.trim());
-  else sessionStorage.removeItem(TOKEN);
+export function keepKey(key) {
+  if (key) sessionStorage.setItem(KEY, key.trim());
+  else sessionStorage.removeItem(KEY);
 }
 
-export const hasToken = () => sessionStorage.getItem(TOKEN) !== null;
+export const hasKey = () => sessionStorage.getItem(KEY) !== null;
 
 /**
  * Ask for anything; throws Refused.
@@ -49,7 +53,7 @@ export async function request(path, options = {}) {
 export async function ask(path, method = "GET", body = undefined) {
   const headers = {};
   if (body !== undefined) headers["Content-Type"] = "application/json";
-  if (method !== "GET" && hasToken()) headers.Authorization = `Bearer ${sessionStorage.getItem(TOKEN)}`;
+  if (method !== "GET" && hasKey()) headers.Authorization = `Bearer ${sessionStorage.getItem(KEY)}`;
   return (await request(path, { method, headers, body: JSON.stringify(body) })).json().catch(() => ({}));
 }
 

@@ -1,0 +1,68 @@
+"""Tracebacks in notebooks, which end at the user's own line.
+
+The functions that stand between the user's call and the user's function have a variable ``__tracebackhide__``: IPython,
+its debugger and pytest fold their frames away. IPython shows the last frame all the same, which is one of EPypes where
+EPypes itself raises, or calls a C function. IPython asks an exception that has ``_render_traceback_`` for its lines.
+"""
+
+from __future__ import annotations
+
+import sys
+from types import FrameType, TracebackType
+from typing import Any, Final
+
+HIDE: Final = "__tracebackhide__"
+_RENDER: Final = "_render_traceback_"
+_OWN: Final = ("epypes", "epypes_widgets")
+
+
+def is_hidden(frame: FrameType) -> bool:
+    """Whether a frame is one that stands between the user's call and the user's function."""
+    return HIDE in frame.f_code.co_varnames
+
+
+def fold_end(error: BaseException) -> None:
+    """Have IPython end the traceback of a user's exception at the user's line, if a C function has raised it."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    if "IPython" in sys.modules and last is not None and is_hidden(last.tb_frame):
+        # Not a method of this exception, which would then refer to itself, and live on with all its inputs.
+        error._render_traceback_ = render  # type: ignore[attr-defined]
+
+
+def render(error: BaseException | None = None, *, is_own: bool = False) -> list[str]:
+    """Return the lines that IPython shows of an exception, without the frames of EPypes at its end.
+
+    Parameters
+    ----------
+    error
+        The exception; without, the one that is being handled, or was handled last.
+    is_own
+        Whether EPypes has raised it: every frame of EPypes at its end is left out, not only the hidden ones.
+    """
+    shown: Any = error or sys.exc_info()[1] or sys.last_value
+    shell: Any = sys.modules["IPython"].get_ipython()
+    traceback = shown.__traceback__
+    if shell.InteractiveTB.skip_hidden:
+        traceback = _without_end(traceback, is_own) or traceback
+    lines: list[str] = shell.InteractiveTB.structured_traceback(type(shown), shown, traceback)
+    return lines
+
+
+def _without_end(traceback: TracebackType | None, is_own: bool) -> TracebackType | None:
+    """Return a traceback up to the last frame that is shown; None if none is."""
+    parts = []
+    while traceback is not None:
+        parts.append(traceback)
+        traceback = traceback.tb_next
+    while parts and (is_hidden(parts[-1].tb_frame) or (is_own and _is_own(parts[-1].tb_frame))):
+        parts.pop()
+    made = None
+    for part in reversed(parts):
+        made = TracebackType(made, part.tb_frame, part.tb_lasti, part.tb_lineno)
+    return made
+
+
+def _is_own(frame: FrameType) -> bool:
+    return str(frame.f_globals.get("__name__")).partition(".")[0] in _OWN
