@@ -22,7 +22,7 @@ from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
-from epypes.bundle.resolve import Importable, Refused, importable
+from epypes.bundle.resolve import Importable, Refused, importable, names_of
 from epypes.nothing import Nothing
 from epypes.run.guard import is_plain_array
 
@@ -217,6 +217,10 @@ class _Writer:
             return source
         if type(value) in (tuple, list, dict):
             return bracketed(value, self.write)
+        # A list finds NaN by its identity.
+        nan = importable(value, "nan") if type(value) is float and value != value else None
+        if nan is not None:
+            return self.gathered.reference(nan, self.what)
         call = _call_of(value)
         if call is not None:
             made_by, arguments = call
@@ -248,7 +252,7 @@ class _Writer:
             return f"{self.write(origin)}[{'...' if given == [...] else self.write(given)}, {self.write(result)}]"
         if origin is not None:
             return f"{self.write(origin)}[{self._joined(value.__args__)}]"
-        home = importable(value)
+        home = importable(value, *names_of(value, vars(types)))
         if home is not None:
             return gathered.reference(home, what)
         if isinstance(value, type):
@@ -305,7 +309,9 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         flags = re.RegexFlag(value.flags & ~re.UNICODE)
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
-        return pathlib.Path, (str(value),)
+        return pathlib.Path if isinstance(value, pathlib.Path) else kind, (str(value),)
+    if kind is types.MappingProxyType:
+        return kind, (dict(value),)
     if kind in _KNOW_THEIR_CALL:
         made_by, arguments = value.__reduce__()[:2]
         return made_by, arguments
@@ -314,7 +320,9 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
 
         if isinstance(value, np.dtype):
             return np.dtype, (value.str if value.names is None else value.descr,)
-        if isinstance(value, np.number | np.bool_):
+        if isinstance(value, np.datetime64 | np.timedelta64):
+            return kind, ("NaT" if np.isnat(value) else int(value.astype(np.int64)), np.datetime_data(value.dtype))
+        if isinstance(value, np.number | np.bool_ | np.character):
             return kind, (value.item(),)
     return None
 

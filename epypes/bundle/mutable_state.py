@@ -15,8 +15,11 @@ closure holds it. What can't be compared is forgotten or put back after each cal
 property has computed, a cache that is held elsewhere, and the attributes of a node of the user's own class, which may
 count its calls. A function that reaches one of these never runs beside another one.
 
-A background model or a filter of OpenCV that outlives the call counts as changed. What a pipeline of the user's own
-class has in its attributes is not looked at.
+An object of a library is compared by its attributes, also private ones: what it computes when it is first asked is put
+back without a failure. One that keeps its content in C is compared by what pickle writes of it, one of OpenCV by what
+its getters return. What none of these can read, such as a background model or a hash, counts as changed whatever the
+call does, so that promotion refuses what refers to it. What a pipeline of the user's own class has in its attributes is
+not looked at.
 
 How Python and libraries are set, and the variables of the context, are compared after each call of the user's
 functions. What a call sets in its context is gone with that; what else it has set is put back. What the code could
@@ -36,11 +39,13 @@ from __future__ import annotations
 
 import dis
 import functools
+import gc
 import itertools
+import pickle
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar, copy_context
 from enum import Enum
@@ -48,9 +53,18 @@ from logging import Logger
 from typing import Any, Final
 
 from epypes.bundle.libraries import OF_THE_PROCESS
+from epypes.bundle.objects import is_unset
 from epypes.bundle.private_import import import_module, plain_name
-from epypes.bundle.process_settings import GlobalGenerators, ProcessSettings, is_setting
+from epypes.bundle.process_settings import (
+    DRAWING_METHODS,
+    GlobalGenerators,
+    ProcessSettings,
+    are_drawn_by,
+    draws_or_seeds,
+    is_setting,
+)
 from epypes.bundle.references import (
+    attributes_loaded,
     cells_of,
     defaults_of,
     global_names,
@@ -63,7 +77,7 @@ from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.pipeline.node import wrap_calls
-from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
+from epypes.run.guard import WATCH, WRITTEN, as_written, is_array, is_unguarded
 from epypes.run.snapshot import (
     Found,
     Record,
@@ -72,6 +86,7 @@ from epypes.run.snapshot import (
     as_dict,
     cached_properties,
     is_global_generator,
+    is_numpy_scalar,
     is_own,
     is_same,
 )
@@ -81,6 +96,8 @@ _CACHED: Final = type(functools.cache(len))
 _CHECKED: Final = "__epypes_checked__"
 # An attribute of that one: the snapshots of its mutable values.
 _VALUES: Final = "__epypes_values__"
+# Another: the names that the code has which may ask for its values.
+_WORDS: Final = "__epypes_words__"
 # A cache is emptied when it has more values than this that must be compared at each call.
 _MOST_VALUES: Final = 1_000
 # Code with one of these names or instructions can bind names of its module, of closures, or attributes; code with one
@@ -93,6 +110,25 @@ _BINDS: Final = frozenset(
 _UNLOCKS: Final = frozenset(
     {"setflags", *(f"STORE_ATTR {name}" for name in ("writeable", "shape", "dtype", "strides", "data"))}
 )
+# Code with one of these notices that an array is locked, and may go on: its arrays are compared instead.
+_NOTICES_LOCKS: Final = frozenset(
+    {"except", "suppress", "__exit__", "exception", "flags", "__array_interface__", "__array_struct__", "ctypes"}
+    | {"Thread", "ThreadPoolExecutor", "submit"}
+)
+# Code with one of these may set something for the whole process until it is done: it never runs beside another call.
+_SETS_FOR_A_WHILE: Final = frozenset(
+    {"chdir", "environ", "field_size_limit", "option_context", "patch", "rcParams", "rc_context", "redirect_stderr"}
+    | {"redirect_stdout", "register_dialect", "reset_option", "set_option", "setfirstweekday", "setlocale"}
+)
+# Inference sessions are too large to compare, and their weights change where they are trained alone.
+_OF_NETWORKS: Final = frozenset({"onnxruntime", "openvino", "tensorflow", "tflite_runtime", "torch"})
+# Objects that Python hands on, such as partials, patterns and locks: what they hold is looked at, or never changes.
+_HANDED_ON: Final = frozenset(
+    {"_contextvars", "_operator", "_thread", "_weakref", "builtins", "contextvars", "datetime", "epypes", "functools"}
+    | {"operator", "re", "threading", "types", "typing", "weakref", "zoneinfo"}
+)
+# How a class of a library says what pickle writes of its objects.
+_PICKLING: Final = ("__getstate__", "__reduce__", "__reduce_ex__")
 # Python makes these itself when they are first asked for; an Enum adds combinations of its members then.
 _OF_PYTHON: Final = frozenset(
     {"__builtins__", "__warningregistry__", "__dict__", "__weakref__", "__doc__", "__abstractmethods__", "_abc_impl"}
@@ -106,7 +142,7 @@ _OF_A_LOGGER: Final = frozenset(vars(Logger("")))  # noqa: LOG001 - one that nob
 _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__setattr__", "__delattr__"})
 # Py_TPFLAGS_HEAPTYPE: a class with this flag is no static one of C, which takes no attributes.
 _MADE_BY_PYTHON: Final = 1 << 9
-_SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
+_SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal", "_csv": "csv"}
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
 
@@ -124,6 +160,8 @@ class CodeSnapshot(Snapshot):
         The arrays that are not locked but compared, by id; those of libraries' objects are added.
     lock
         Whether all others are locked; else they are added too.
+    words
+        Names that the code has which gets the values, besides those that are met.
 
     Attributes
     ----------
@@ -133,16 +171,27 @@ class CodeSnapshot(Snapshot):
         The nodes and pipelines that were met, by id.
     words
         The names that the code has, its instructions, and the names of the libraries whose objects it names.
+    draws, seeds
+        The functions of the random generators of the whole process by which the code draws, and whether it seeds one.
     has_code
         Whether code of the user was met.
     """
 
-    def __init__(self, functions: Mapping[str, object], compared: dict[int, object], *, lock: bool = True) -> None:
+    def __init__(
+        self,
+        functions: Mapping[str, object],
+        compared: dict[int, object],
+        *,
+        lock: bool = True,
+        words: Collection[str] = (),
+    ) -> None:
         self._compared, self._lock = compared, lock
         self.resets: list[Callable[[], object]] = []
         self.nodes: dict[int, Node] = {}
         self._caches: list[tuple[str, Any, list[CodeSnapshot]]] = []
-        self.words: set[str] = set()
+        self.words: set[str] = {*words}
+        self.draws: set[str] = set()
+        self.seeds = False
         self.has_code = False
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
@@ -153,21 +202,32 @@ class CodeSnapshot(Snapshot):
             if needed & self.words:
                 add()
         self._possible.clear()
+        for _, cached, _ in self._caches:
+            vars(cached).setdefault(_WORDS, set()).update(self.words)
         self._compare_libraries()
 
     def __bool__(self) -> bool:
         return bool(self.records or self.resets or self._caches)
 
     def changed(self) -> str | None:
-        """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
+        """Return the first object that has changed, by the name that the code knows it by; None if there is none.
+
+        It is "" where libraries alone have computed something that is put back without a failure.
+        """
+        is_quiet = False
         for record in self.records:
             if record.differs():
-                return record.changed_name() if isinstance(record, _Bindings) else record.name
+                name = record.changed_name() if isinstance(record, _Bindings) else record.name
+                if name:
+                    return name
+                is_quiet = True
         for name, _, values in self._caches:
             for value in values:
-                if value.changed() is not None:
+                changed = value.changed()
+                if changed:
                     return name
-        return None
+                is_quiet |= changed is not None
+        return "" if is_quiet else None
 
     def reset(self) -> None:
         """Put back or forget what a call may change without a failure."""
@@ -191,8 +251,7 @@ class CodeSnapshot(Snapshot):
         """Look into code too."""
         kind = type(value)
         home = value.__name__ if kind is types.ModuleType else getattr(value, "__module__", None)
-        if is_global_generator(getattr(value, "__self__", None)):
-            self.words.add("random")
+        self._note_draw(value)
         if isinstance(home, str):
             top = home.partition(".")[0]
             self.words |= {_SAME_MODULE.get(top, top), str(getattr(value, "__name__", top))}
@@ -223,12 +282,31 @@ class CodeSnapshot(Snapshot):
                 self._compare(_BINDS, functools.partial(_Bindings, f"{kind.__name__}.{value.name}.", value))
         elif kind is Logger:
             self.records.append(_Bindings(f"{name}.", value))
-        elif is_model_of_cv2(value):
-            self.records.append(Record(name, value, _always_another, lambda value, saved: None))
         elif not is_array(value) and type(attributes) is dict:
             # A library's own code may not take read-only arrays.
             self._compared.update((id(part), part) for part in attributes.values() if is_array(part))
+        known, may_hide = len(self.records), _may_hide(value)
+        if may_hide:
+            self._compared.update((id(part), part) for part in gc.get_referents(value) if is_array(part))
         yield from super().look_at(name, value)
+        if may_hide and (type(attributes) is dict or len(self.records) == known):
+            yield from self._look_at_hidden(name, value)
+
+    def _look_at_hidden(self, name: str, value: Any) -> Found:
+        """Look at what an object of a library has in private attributes, or where Python can't see it."""
+        kind, attributes = type(value), getattr(value, "__dict__", None)
+        is_of_cv2 = str(kind.__module__).partition(".")[0] == "cv2"
+        if is_of_cv2 and not is_model_of_cv2(value):
+            self.records.append(_Content(name, value, _read_getters, _leave))
+            self._compare(_unreadable_setters(kind), functools.partial(_Content, name, value, _always_another, _leave))
+        elif not is_of_cv2 and _pickled(value) and (type(attributes) is not dict or _has_pickling(kind)):
+            self.records.append(_Content(name, value, _pickled, _leave))
+        elif type(attributes) is dict:
+            record = _HiddenAttributes(f"{name}.", value, self.words)
+            self.records.append(record)
+            yield from ((name, part) for part in as_dict(record.saved).values())
+        else:
+            self.records.append(_Content(name, value, _always_another, _leave))
 
     def look_at_array(self, name: str, value: Any) -> Found:
         """Lock an array, instead of making a copy of it to compare with."""
@@ -250,6 +328,8 @@ class CodeSnapshot(Snapshot):
         self._compare(_BINDS, functools.partial(_Bindings, f"{function.__name__}.", function))
         for inner in nested_codes(code):
             self._note_instructions(inner)
+        for part in attributes_loaded(function):
+            self._note_draw(part)
         yield from meanings_of(function, global_names(code)).items()
         for name in imported_modules(function):
             # A module of the bundle is imported now: what it holds when a call imports it could not be put back.
@@ -266,15 +346,23 @@ class CodeSnapshot(Snapshot):
         attributes = function.__dict__.items()
         yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
 
+    def _note_draw(self, value: Any) -> None:
+        """Note a function that draws from a random generator of the whole process, or seeds it."""
+        is_draw, is_seed = draws_or_seeds(value)
+        self.draws |= {value.__name__} if is_draw else set()
+        self.seeds |= is_seed
+
     def _note_instructions(self, code: types.CodeType) -> None:
         """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
-        self.has_code = True
+        self.has_code, handlers = True, 0
         self.words.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
+            handlers += {"PUSH_EXC_INFO": 1, "WITH_EXCEPT_START": -1}.get(operation, 0)
             if operation.startswith(("STORE_", "DELETE_")):
                 is_free = operation.endswith("_DEREF") and name in code.co_freevars
                 self.words |= {operation, f"{operation} {name}", *(["nonlocal"] if is_free else [])}
+        self.words |= {"except"} if handlers > 0 else set()
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):
@@ -340,9 +428,77 @@ class CodeSnapshot(Snapshot):
         self._possible.append((needed, lambda: self.records.append(make())))
 
 
+def _may_hide(value: Any) -> bool:
+    """Whether a value is an object of a library, which may have content that no other way of comparing sees."""
+    kind = type(value)
+    home = str(kind.__module__).partition(".")[0]
+    if is_own(str(kind.__module__)) or home in _HANDED_ON | _OF_NETWORKS or is_numpy_scalar(kind):
+        return False
+    is_container = isinstance(value, tuple | list | dict | set | Logger | Enum) or is_array(value)
+    is_of_pandas = home == "pandas" and hasattr(value, "equals")
+    is_executor = any(base.__name__ in ("Executor", "dnn_Net") for base in kind.__mro__)
+    is_known = is_container or is_of_pandas or is_executor or is_global_generator(value)
+    return not is_known and not (callable(value) and hasattr(value, "__name__"))
+
+
+class _Content(Record):
+    """The content of an object as a copy, which can't be put back."""
+
+    __slots__ = ()
+
+
+def _leave(value: Any, saved: object) -> None:
+    """Leave an object as it is: what it holds can't be set."""
+
+
 def _always_another(value: Any) -> tuple[object, ...]:
     """Return contents that differ from those of any other call."""
     return (object(),)
+
+
+def _has_pickling(kind: type) -> bool:
+    """Whether a class says itself what pickle writes of its objects."""
+    return any(getattr(kind, name, None) is not getattr(object, name, None) for name in _PICKLING)
+
+
+def _pickled(value: Any) -> tuple[bytes, ...]:
+    """Return what pickle writes of an object; nothing if it can't."""
+    try:
+        return (pickle.dumps(value, pickle.HIGHEST_PROTOCOL),)
+    except Exception:  # whatever an object raises that can't be pickled
+        return ()
+
+
+@functools.cache
+def _getters(kind: Any) -> list[str]:
+    """Return the methods and attributes of a class of OpenCV that may say what its objects hold."""
+    slots = (name for name in dir(kind) if isinstance(getattr(kind, name), types.GetSetDescriptorType))
+    return [*(name for name in dir(kind) if name.startswith(("get", "is")) or name == "empty"), *slots]
+
+
+def _unreadable_setters(kind: Any) -> frozenset[str]:
+    """Return the methods of a class of OpenCV that set what no getter returns."""
+    known = {name.removeprefix("get").lower() for name in _getters(kind)}
+    return frozenset(name for name in dir(kind) if name.startswith("set") and name[3:].lower() not in known)
+
+
+def _read_getters(value: Any) -> tuple[Any, ...]:
+    kind: Any = type(value)
+    found: list[Any] = []
+    for name in _getters(kind):
+        with suppress(Exception):  # what takes arguments, or is not there yet
+            part = getattr(value, name)
+            found.append((name, _plain(part() if callable(part) else part)))
+    return tuple(found)
+
+
+def _plain(value: Any) -> Any:
+    """Return what a getter has returned as values that can be compared."""
+    if is_array(value):
+        return value.shape, value.tobytes()
+    if isinstance(value, tuple | list):
+        return tuple(map(_plain, value))
+    return _read_getters(value) if type(value).__module__[:3] == "cv2" else value
 
 
 def _forget(value: Any, lazy: frozenset[str]) -> None:
@@ -390,6 +546,43 @@ class _Bindings(Record):
             and not is_same(after.get(name, self), before.get(name, self))
             and not (isinstance(after.get(name), types.ModuleType) and before.get(name) is None)
         ]
+
+
+class _HiddenAttributes(_Bindings):
+    """The private attributes of a library's object.
+
+    What begins as None or False, or is not there, the library computes when it is first asked, unless the user's code
+    sets it: that is put back without a failure.
+    """
+
+    __slots__ = ("words",)
+
+    def __init__(self, name: str, value: Any, words: Collection[str]) -> None:
+        self.words = words
+        Record.__init__(self, name, value, _read_private, _write_private)
+
+    def changed_name(self) -> str:
+        """Return what has another value, "" if the library has computed all of it."""
+        before = as_dict(self.saved)
+        loud = (
+            name
+            for name in self._others(self.read(self.value))
+            if not is_unset(before.get(name)) or f"STORE_ATTR {name}" in self.words
+        )
+        return next((f"{self.name}{name}" for name in loud), "")
+
+
+def _read_private(value: Any) -> tuple[Any, ...]:
+    lazy = cached_properties(type(value))
+    found = {name: part for name, part in vars(value).items() if name[:1] == "_" and name not in lazy}
+    return *found, *found.values()
+
+
+def _write_private(value: Any, saved: tuple[Any, ...]) -> None:
+    before = as_dict(saved)
+    for name in as_dict(_read_private(value)).keys() - before.keys():
+        del vars(value)[name]
+    vars(value).update(before)
 
 
 class _LibraryBindings(_Bindings):
@@ -505,7 +698,8 @@ def _checked(cached: Any) -> Any:
 
     def compute(*args: Any, **kwargs: Any) -> Any:
         result = function(*args, **kwargs)
-        snapshot = CodeSnapshot({"": result}, {})  # locks its arrays
+        words = vars(made).get(_WORDS, frozenset())
+        snapshot = CodeSnapshot({"its value": result}, {}, lock=not _NOTICES_LOCKS & words, words=words)
         if snapshot:
             if len(values) >= _MOST_VALUES:
                 made.cache_clear()
@@ -519,6 +713,21 @@ def _checked(cached: Any) -> Any:
     vars(made)[_VALUES] = values
     vars(cached)[_CHECKED] = vars(made)[_CHECKED] = made
     return made
+
+
+def draws_without_seed(functions: Mapping[str, Any]) -> list[str]:
+    """Return for each function that draws random numbers after another one's seed why events could mix them up."""
+    written = {name: as_written(function) for name, function in _with_inner(functions)}
+    found = {name: CodeSnapshot({name: function}, {}, lock=False) for name, function in written.items()}
+    draws = {name: snapshot.draws | DRAWING_METHODS & snapshot.words for name, snapshot in found.items()}
+    seeding = next((name for name, snapshot in found.items() if snapshot.seeds), "")
+    return [
+        f"Function {name!r} draws by {min(draws[name])!r} from a random generator of the whole process, which "
+        f"function {seeding!r} seeds: events on other threads draw from it in between. Seed it in {name!r}, or draw "
+        "from np.random.default_rng(seed)."
+        for name, snapshot in found.items()
+        if seeding and draws[name] and not snapshot.seeds
+    ]
 
 
 # -- calls ---------------------------------------------------------------------------------------------------------
@@ -547,9 +756,11 @@ class MutableState:
         # The nodes, also of pipelines, that functions refer to and may call themselves, by id.
         self._referred: dict[int, Node] = {}
         for name, function in _with_inner(functions):
-            if is_unguarded(function):
-                # It rejects read-only arrays.
-                CodeSnapshot({name: function}, self._compared, lock=False)
+            found: dict[int, object] = {}
+            snapshot = CodeSnapshot({name: function}, found, lock=False)
+            if is_unguarded(function) or _NOTICES_LOCKS & snapshot.words:
+                # It rejects read-only arrays, or may go on without what it would write.
+                self._compared.update(found)
 
     def guarded(self, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
         """Have runners and nodes call what compares the state of these functions; return them, odd kinds wrapped.
@@ -591,8 +802,8 @@ class MutableState:
         self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot, node: Node | None = None
     ) -> Callable[..., Any]:
         lock, referred, settings = self._lock, self._referred, self._settings
-        draws = self._generators.are_drawn_by(snapshot.words)
-        has_resets = draws or bool(snapshot.resets)
+        draws = bool(snapshot.draws) or snapshot.seeds or are_drawn_by(snapshot.words)
+        has_resets = draws or bool(snapshot.resets) or not _SETS_FOR_A_WHILE.isdisjoint(snapshot.words)
         attempt = functools.partial(_attempt, function, snapshot if snapshot else None, settings)
 
         @functools.wraps(function)
@@ -655,7 +866,8 @@ def _attempt(
         snapshot.reset()
         changed = snapshot.changed()
     try:
-        return result, error, settings.changed(context, modules) if changed is None else changed
+        found = None if changed else settings.changed(context, modules)
+        return result, error, changed if found is None else found
     finally:
         # The exception refers to this frame, which refers to the exception, and to the images of the call.
         del error, result

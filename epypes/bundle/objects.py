@@ -22,6 +22,7 @@ import threading
 import types
 import warnings
 import weakref
+from abc import ABCMeta, _get_dump  # type: ignore[attr-defined]
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -239,6 +240,8 @@ def _class(kind: type) -> Description:
     parts: list[tuple[str, Any]] = [(" metaclass", type(kind)), (" bases", kind.__bases__), *_annotations(kind)]
     if isinstance(kind.__doc__, str):  # a class of C code may have a descriptor for it
         parts.append((f"{ANNOTATION}its docstring", kind.__doc__))
+    if registered := registered_classes(kind):
+        parts.append((" registered classes", registered))
     if "__dataclass_params__" in vars(kind):
         parts.append((" options", repr(vars(kind)["__dataclass_params__"])))
     if isinstance(kind, enum.EnumMeta):
@@ -251,6 +254,12 @@ def _class(kind: type) -> Description:
     names = sorted(own, key=lambda name: (name.startswith("__"), name))
     parts += ((f" {name!r}", own[name]) for name in names)
     return Description("class", (kind.__name__,), parts, module=kind.__module__)
+
+
+def registered_classes(kind: type) -> list[type]:
+    """Return the classes that count as subclasses of an abstract one by its ``register``."""
+    found = _get_dump(kind)[0] if isinstance(kind, ABCMeta) else ()
+    return sorted(filter(None, (one() for one in found)), key=lambda one: one.__qualname__)
 
 
 # -- graphs ----------------------------------------------------------------------------------------------------------
@@ -373,6 +382,11 @@ def _without_computed(kind: type, state: Any) -> Any:
     return (
         {name: state[name] for name in sorted(state, key=str) if name not in computed} if type(state) is dict else state
     )
+
+
+def is_unset(value: Any) -> bool:
+    """Whether this is what a private attribute begins with that a library computes when it is first asked."""
+    return value is None or value is False
 
 
 _VECTORIZE: Final = ("numpy", "vectorize")

@@ -25,7 +25,7 @@ from types import CodeType, FrameType
 from typing import Any, Final
 
 from epypes.bundle.compare import Difference, differences
-from epypes.bundle.file_access import FileAccess
+from epypes.bundle.file_access import FileAccess, writing_calls
 from epypes.bundle.fingerprint import Digester
 from epypes.bundle.libraries import library_attributes
 from epypes.bundle.load import MODULES_OF_A_BUNDLE, WITH_DELAYS, Bundle, read_bundle
@@ -39,7 +39,10 @@ from epypes.bundle.manifest import (
     own_packages,
     recorded_environment,
 )
+from epypes.bundle.mutable_state import draws_without_seed
+from epypes.bundle.own_modules import functions_reached_by
 from epypes.bundle.process_settings import GlobalGenerators, library_settings
+from epypes.bundle.references import nested_codes
 from epypes.bundle.replay import ReplayReport, record_again, replay
 from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
 from epypes.bundle.resolve import evaluated
@@ -173,7 +176,7 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
         _load_named(text, own)
     return replace(
         report,
-        outside=access.files,
+        outside=(*access.files, *draws_without_seed(bundle.cg.functions), *_unproved_writes(bundle, ran)),
         requirements=requirement_lines(named | new),
         libraries=library_attributes(named, new) if with_libraries else {},
         notes=_unproved_lines(ran, folder),
@@ -264,6 +267,22 @@ def _unproved_lines(ran: Mapping[CodeType, Collection[int]], folder: Path) -> li
             text = f"No sample runs these lines of {name}, so no replay proves them: {named}{more}."
             found.append(f"{text} Give payloads that do: samples=[...].")
     return found
+
+
+def _unproved_writes(bundle: Bundle, ran: Mapping[CodeType, Collection[int]]) -> list[str]:
+    """Return as sentences which calls that write files no sample runs: what a later event reads of them is state."""
+    found = []
+    for function in functions_reached_by([*bundle.cg.functions.values(), *bundle.own.values()]):
+        file = Path(function.__code__.co_filename)
+        writes = writing_calls(file) if file.is_relative_to(bundle.path) else {}
+        for code in nested_codes(function.__code__) if writes else ():
+            missed = {line for _, _, line in code.co_lines() if line} - set(ran.get(code, ()))
+            found += [
+                f"{code.co_name}() writes a file by {writes[line]!r} ({file.relative_to(bundle.path).as_posix()}, line "
+                f"{line}), which no sample runs. Give a payload that does: samples=[...]; or leave it out."
+                for line in sorted(missed & writes.keys())
+            ]
+    return list(dict.fromkeys(found))
 
 
 # -- verification ---------------------------------------------------------------------------------------------------

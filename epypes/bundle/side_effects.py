@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import builtins
 import inspect
+import re
 import sys
 import types
 from collections import deque
@@ -17,6 +18,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 from epypes.bundle.private_import import loaded_module
+from epypes.bundle.process_settings import SETTINGS
 from epypes.bundle.references import global_names, module_of_import, namespace_of
 from epypes.bundle.resolve import (
     Definition,
@@ -153,9 +155,13 @@ def check_notebook_name(name: str, found: Definition) -> None:
 
 
 # By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
-_REFLECTING: Final = (builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack)
+_REFLECTING: Final = (
+    *(builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack),
+    *(inspect.getfile, inspect.getmodule, inspect.getsource, inspect.getsourcefile, inspect.getsourcelines),
+)
 _REFLECTING_ATTRIBUTES: Final = frozenset(
-    {"__globals__", "__builtins__", "f_globals", "f_locals", "f_builtins", "f_back"}
+    {"__globals__", "__builtins__", "__subclasses__", "f_globals", "f_locals", "f_builtins", "f_back", "f_lineno"}
+    | {"tb_lineno", "co_filename", "co_firstlineno", "__firstlineno__", "co_name", "co_qualname"}
 )
 
 
@@ -171,6 +177,54 @@ def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
                 raise Refused(f"{text} what no name in it says. Use what you need by its name, or make it a token.")
 
 
+# Functions of Python's library that set something for the whole process are called like this, but for those that
+# begin in the same way; functions of other libraries that do.
+_SETTER: Final = re.compile(r"(un)?register|set(?!$|attr|item|_blocking)|disable|enable|umask$|tzset$")
+_SETTERS: Final = (
+    *(("cv2.ocl", "setUseOpenCL"), ("cv2.ipp", "setUseIPP"), ("numpy", "setbufsize"), ("numpy", "seterrcall")),
+    *(("scipy.fft", "set_global_backend"), ("sklearn", "set_config")),
+)
+
+
+def _sets_process(value: Any) -> bool:
+    """Whether a function sets for the whole process what the comparison of its settings doesn't read."""
+    if not isinstance(value, types.FunctionType | types.BuiltinFunctionType | types.MethodType):
+        return False
+    home, name = str(value.__module__).lstrip("_"), value.__name__
+    owner = getattr(value, "__self__", None)
+    is_plain = owner is None or isinstance(owner, types.ModuleType) or name == "register"
+    is_of_python = home.partition(".")[0] in sys.stdlib_module_names and home not in {one.module for one in SETTINGS}
+    is_setter = is_of_python and is_plain and _SETTER.match(name) is not None
+    return is_setter or any(value is getattr(sys.modules.get(home), name, None) for home, name in _SETTERS)
+
+
+def _check_setters(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that calls a function which sets something for the whole process."""
+    # What decorators register is there when the module has been imported.
+    for node in ast.walk(ast.Module([*found.node.body], [])):
+        for read in (node, *_attribute_of(node, "getattr")):
+            if isinstance(read, ast.Name | ast.Attribute) and _sets_process(evaluated(read, names)):
+                raise _setter(found.what, f"{ast.unparse(read)!r} ({found.place_in(node)})")
+
+
+def _check_mocks(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that patches by ``unittest.mock`` but in a 'with' statement, which undoes it."""
+    parts = [*ast.walk(ast.Module([*found.node.body], []))]
+    calls = [item.context_expr for part in parts if isinstance(part, ast.With) for item in part.items]
+    undone = {id(part) for call in calls if isinstance(call, ast.Call) for part in ast.walk(call.func)}
+    for node in parts:
+        value = evaluated(node, names) if isinstance(node, ast.Name | ast.Attribute) else None
+        is_patch = getattr(value, "__module__", "") == "unittest.mock" and "patch" in getattr(value, "__name__", "")
+        if is_patch and id(node) not in undone:
+            text = f"{found.what} uses {ast.unparse(node)!r} ({found.place_in(node)}) outside of a 'with' statement"
+            raise Refused(f"{text}, so that later events may find it patched. Write: with {ast.unparse(node)}(...):")
+
+
+def _setter(what: str, name: str) -> Refused:
+    text = f"{what} uses {name}, which sets something for the whole process, for later events and other threads too"
+    return Refused(f"{text}. Do it in the notebook if no result depends on it, or leave it out.")
+
+
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
 
@@ -178,6 +232,8 @@ def check_reads(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads by reflection, or what the notebook has changed in a library's module or class."""
     names = {**sys.modules, **found.names, **imported_by(found)}
     _check_reflection(found, names)
+    _check_setters(found, names)
+    _check_mocks(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
@@ -199,6 +255,8 @@ def check_reads(found: Definition, known: Patches) -> None:
 def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
     """Refuse an object that can be imported only as the notebook has changed it."""
     name = qualname.partition(".")[0]
+    if _sets_process(getattr(loaded_module(module), name, None)):
+        raise _setter(what, repr(f"{module}.{qualname}"))
     place = _place_of_patch(known, loaded_module(module), name, "by a name that no text has")
     if place:
         raise _patched(what, f"{module}.{qualname}", place)
@@ -236,7 +294,8 @@ def _is_patched(owner: Any, name: str) -> bool:
     """Whether a module has a function, class or mock of the notebook, in whatever way that was put there."""
     value = vars(owner).get(name) if isinstance(owner, types.ModuleType) and owner.__name__ != "__main__" else None
     is_own = isinstance(value, types.FunctionType) and value.__globals__.get("__name__") == "__main__"
-    homes = (getattr(value, "__module__", ""), type(value).__module__)
+    is_mocks = isinstance(owner, types.ModuleType) and owner.__name__ == "unittest.mock"
+    homes = () if is_mocks else (getattr(value, "__module__", ""), type(value).__module__)
     return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
 
 
