@@ -59,7 +59,7 @@ from epypes.tracebacks import render
 from epypes.wording import keep_as_state
 
 if TYPE_CHECKING:
-    from epypes.bundle.replay import ReplayReport
+    from epypes.bundle.proof.replay import ReplayReport
     from epypes.images import Image
     from epypes.service.parameters import Parameters
 

@@ -14,7 +14,7 @@ from skimage import data
 from xdist.scheduler import LoadFileScheduling
 
 import epypes as ep
-from epypes.bundle import replay_process
+from epypes.bundle.proof import replay_process
 from epypes.cli import main
 from tests import hangs
 from tests.brokers.fixtures import broker, certificates, mosquitto, nats, rabbitmq

@@ -1,6 +1,6 @@
 """Replays of bundles in processes that have NumPy and EPypes loaded already.
 
-Promotion replays a bundle in an interpreter of its own (``python -s -P -m epypes.bundle.replay_process``), half of whose time goes
+Promotion replays a bundle in an interpreter of its own (``python -s -P -m epypes.bundle.proof.replay_process``), half of whose time goes
 into imports and the metadata of packages. Here a server has done that once, isolated likewise, and each replay is a
 fork of it: a process of its own in which none of the bundle's imports has been done. Tests with the fixture
 ``fresh_interpreter`` start the real one.
@@ -26,7 +26,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-_REPLAY = [sys.executable, "-s", "-P", "-m", "epypes.bundle.replay_process"]
+_REPLAY = [sys.executable, "-s", "-P", "-m", "epypes.bundle.proof.replay_process"]
 
 
 class WarmProcesses:
@@ -79,7 +79,7 @@ class WarmProcesses:
 
 def serve(address: str) -> None:
     """Fork for each request until standard input ends."""
-    import epypes.bundle.replay_process
+    import epypes.bundle.proof.replay_process
     import epypes.pipeline
     import epypes.wire.samples  # noqa: F401 - all of that is loaded for the forks
     from epypes.bundle.requirements import bringing

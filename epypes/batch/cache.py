@@ -25,7 +25,7 @@ from epypes.batch.cases import Case
 from epypes.batch.items import Item, frames_of
 from epypes.batch.results import Outcome
 from epypes.bundle import to_source
-from epypes.bundle.fingerprint import Digester, combined_digest, file_digest, versions_of
+from epypes.bundle.proof.fingerprint import Digester, combined_digest, file_digest, versions_of
 from epypes.errors import EpypesError, PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner

@@ -25,7 +25,7 @@ from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
 from epypes.batch.results import BatchResult, ErrorInfo, HtmlColumn, Outcome, failure_column, frame_of, html_table
 from epypes.batch.thumbnails import DIFFERENCE_LEGEND, Thumbnail, comparison_thumbnails
-from epypes.bundle.compare import first_difference
+from epypes.bundle.proof.compare import first_difference
 from epypes.bundle.settings import Member
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph

@@ -38,7 +38,7 @@ from epypes.batch.packaged_graph import (
     unpacked_outcomes,
 )
 from epypes.batch.results import ErrorInfo, Outcome
-from epypes.bundle.clone import clone_runner
+from epypes.bundle.source.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ImageFileError, ScaleError
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner

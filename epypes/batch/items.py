@@ -13,7 +13,7 @@ from typing import Any, Final
 from epypes.acquisition.files import IMAGE_ENDINGS, image_files, is_video_name, natural_order, read_image
 from epypes.acquisition.frames import Frame, with_images
 from epypes.acquisition.video import Video, VideoFrame
-from epypes.bundle.clone import clone_runner
+from epypes.bundle.source.clone import clone_runner
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph, colour_order
 from epypes.run import CompGraphRunner

@@ -322,7 +322,7 @@ def _is_array(value: Any) -> bool:
 
 
 def _is_same(value: Any, expected: Any) -> bool:
-    from epypes.bundle.compare import first_difference
+    from epypes.bundle.proof.compare import first_difference
 
     if type(value) is not type(expected) and isinstance(value, float | int) and isinstance(expected, float | int):
         return bool(value == expected)

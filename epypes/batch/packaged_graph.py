@@ -21,10 +21,10 @@ from epypes.batch.items import Item, frames_of, payload_of
 from epypes.batch.job import Job, run_job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote
-from epypes.bundle.clone import clone_runner
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, REQUIREMENTS, SAMPLES, bundle_files
 from epypes.bundle.settings import Unwritable, decode_value, encode_value, members_in
+from epypes.bundle.source.clone import clone_runner
 from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array

@@ -19,8 +19,8 @@ from epypes.bundle.manifest import (
     bundle_files,
     check_manifest,
 )
-from epypes.bundle.mutable_state import MutableState
 from epypes.bundle.private_import import PrivateImport
+from epypes.bundle.proof.mutable_state import MutableState
 from epypes.bundle.settings import Settings, read_settings, states_of
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults

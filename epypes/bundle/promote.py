@@ -28,15 +28,15 @@ from epypes.acquisition.frames import with_images
 from epypes.acquisition.video import Video
 from epypes.bundle.adapters import ANSWER, answer_of, is_usual
 from epypes.bundle.arrays import store_hyperparameters
-from epypes.bundle.clone import clone_runner, parameters_of
-from epypes.bundle.compare import differences
-from epypes.bundle.determinism import prove
 from epypes.bundle.load import MAKER, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, MODULE, SAMPLES, SETTINGS, why_no_bundle
-from epypes.bundle.module import PIPELINES, write_module
-from epypes.bundle.objects import describe_message
-from epypes.bundle.resolve import Refused
+from epypes.bundle.proof.compare import differences
+from epypes.bundle.proof.determinism import prove
 from epypes.bundle.settings import MOST_NUMBERS, Settings, states_of, unwritable, writable_defaults, write_settings
+from epypes.bundle.source.clone import clone_runner, parameters_of
+from epypes.bundle.source.module import PIPELINES, write_module
+from epypes.bundle.source.objects import describe_message
+from epypes.bundle.source.resolve import Refused
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, UnknownName, run_call
 from epypes.graph import ASSUMED, ColourOrder, CompGraph
 from epypes.images import has_colours

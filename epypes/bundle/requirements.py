@@ -23,7 +23,7 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
 from epypes.bundle.manifest import REQUIREMENTS
-from epypes.bundle.references import is_main_guard
+from epypes.bundle.source.references import is_main_guard
 from epypes.errors import BundleError
 
 INSTALL_TIMEOUT_S: Final = 1200.0

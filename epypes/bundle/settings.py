@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from epypes.bundle.arrays import StoredArray
-from epypes.bundle.compare import Tolerance, read_tolerances
+from epypes.bundle.proof.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
 from epypes.errors import BundleError
 from epypes.graph import ASSUMED, ColourOrder, CompGraph, inside_of

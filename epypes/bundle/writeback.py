@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.determinism import prove
 from epypes.bundle.manifest import SETTINGS, check_manifest, digest
 from epypes.bundle.promote import draft_folder, swap_folders
-from epypes.bundle.replay_process import REPLAY_TIMEOUT_S, replay_isolated
+from epypes.bundle.proof.determinism import prove
+from epypes.bundle.proof.replay_process import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.bundle.settings import MOST_NUMBERS, Unwritable, cast_like, decode_value, encode_value
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import

@@ -17,7 +17,7 @@ from epypes.wording import counted, ended
 
 if TYPE_CHECKING:
     from epypes.batch.check import CheckOutcome
-    from epypes.bundle.replay import ReplayReport
+    from epypes.bundle.proof.replay import ReplayReport
 
 
 @command("epypes promote 01_edge_detection.ipynb --name runner --output edges --to services/edges")

@@ -215,8 +215,8 @@ def demo(notebook: Path, to: Path, name: str, output: str) -> None:
     """
     from epypes.acquisition import read_image, write_image
     from epypes.bundle import verify
-    from epypes.bundle.compare import first_difference
     from epypes.bundle.manifest import SAMPLES, SETTINGS
+    from epypes.bundle.proof.compare import first_difference
     from epypes.bundle.settings import read_settings
     from epypes.wire.samples import load_sample
 

@@ -175,7 +175,7 @@ def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **o
     vhost=NAME, ca=FILE.
     """
     from epypes.service import serve as serve_bundle
-    from epypes.service.standard_error import STANDARD_ERROR
+    from epypes.service.supervision.standard_error import STANDARD_ERROR
 
     # No thread of the service waits for a reader of standard error.
     handler = logging.StreamHandler(cast("TextIO", STANDARD_ERROR))

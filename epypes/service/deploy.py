@@ -15,8 +15,8 @@ from epypes.service.dispatcher import Dispatcher
 from epypes.service.event_states import Delays, StateChoice, change_of_state
 from epypes.service.parameters import ParameterControl, differing_values
 from epypes.service.sd_notify import notify, notify_reloading
-from epypes.service.supervisor import Supervisor
-from epypes.service.worker_connection import WorkerConnection
+from epypes.service.supervision.supervisor import Supervisor
+from epypes.service.supervision.worker_connection import WorkerConnection
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack

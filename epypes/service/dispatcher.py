@@ -32,9 +32,9 @@ from epypes.service.result_publisher import (
 )
 
 if TYPE_CHECKING:
-    from epypes.service.frame_socket import WorkerMessage
     from epypes.service.options import Options
-    from epypes.service.worker_connection import HangReport, WorkerConnection
+    from epypes.service.supervision.frame_socket import WorkerMessage
+    from epypes.service.supervision.worker_connection import HangReport, WorkerConnection
     from epypes.transport.channel import Delivery
     from epypes.wire import EncodedEnvelope
 

@@ -22,9 +22,9 @@ from epypes.wording import counted
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
-    from epypes.service.frame_socket import WorkerMessage
     from epypes.service.options import Options
-    from epypes.service.worker_connection import WorkerConnection
+    from epypes.service.supervision.frame_socket import WorkerMessage
+    from epypes.service.supervision.worker_connection import WorkerConnection
 
 StatePer = Literal["one", "source"]
 # What a deploy does with the states.

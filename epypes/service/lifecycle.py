@@ -16,7 +16,7 @@ from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import Endpoints
 from epypes.service.result_publisher import ResultPublisher
 from epypes.service.sd_notify import notify
-from epypes.service.worker_health import WorkerHealth
+from epypes.service.supervision.worker_health import WorkerHealth
 
 State = Literal["LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED"]
 # In these states other replicas are better off with a broker's events.

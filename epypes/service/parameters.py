@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from epypes.service.bundle_info import BundleInfo
     from epypes.service.dispatcher import Dispatcher
     from epypes.service.result_publisher import Listener
-    from epypes.service.worker_connection import WorkerConnection
+    from epypes.service.supervision.worker_connection import WorkerConnection
 
 _log = logging.getLogger("epypes.service")
 

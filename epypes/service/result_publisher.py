@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
     from epypes.service.endpoints import AnswerOutput
     from epypes.service.failures.store import FailureStore
-    from epypes.service.frame_socket import WorkerMessage
     from epypes.service.options import Options
+    from epypes.service.supervision.frame_socket import WorkerMessage
 
 Outcome = Literal["answered", "failed", "dead_letters"]
 FailureKind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]

@@ -22,12 +22,12 @@ from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
 from epypes.service.options import ANY_PORT, Options
 from epypes.service.parameters import ParameterControl, Parameters
-from epypes.service.replicas import Replicas
+from epypes.service.replication.replicas import Replicas
 from epypes.service.result_publisher import EventLog, Latency, Listener, Provenance, ResultPublisher
 from epypes.service.sd_notify import notify
 from epypes.service.state_file import ServiceState
-from epypes.service.supervisor import Supervisor
-from epypes.service.worker_queries import WorkerQueries
+from epypes.service.supervision.supervisor import Supervisor
+from epypes.service.supervision.worker_queries import WorkerQueries
 from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:

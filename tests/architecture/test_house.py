@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tokenize
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -71,6 +72,11 @@ def test_a_module_has_at_most_500_lines_of_code():
     long = [path for path in MODULES if path.read_text().count("\n") > 500]
     lengths = {path.relative_to(ROOT).as_posix(): len(lines_of_code(path)) for path in long}
     assert {module: length for module, length in lengths.items() if length > 500} == {}
+
+
+def test_a_folder_has_at_most_20_modules():
+    counts = Counter(path.parent.relative_to(ROOT).as_posix() for path in MODULES)
+    assert {folder: count for folder, count in counts.items() if count > 20} == {}
 
 
 def lines_of_code(path):

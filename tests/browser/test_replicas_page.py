@@ -6,7 +6,7 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.replica_messages import Heartbeat
+from epypes.service.replication.messages import Heartbeat
 from tests.browser.contrast import schemes, unreadable
 from tests.browser.jupyter import open_page
 from tests.service.replicated import publish_to_replicas

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import epypes as ep
-from epypes.bundle.equivalence import refusal
-from epypes.bundle.module import Graphs, emit_module
 from epypes.bundle.settings import Settings
-from epypes.bundle.slice import gather
+from epypes.bundle.source.equivalence import refusal
+from epypes.bundle.source.module import Graphs, emit_module
+from epypes.bundle.source.slice import gather
 
 
 def slice_graph(functions):

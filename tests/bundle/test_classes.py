@@ -8,8 +8,8 @@ import types
 import pytest
 
 import epypes as ep
-from epypes.bundle.module import emit_module
 from epypes.bundle.settings import Settings
+from epypes.bundle.source.module import emit_module
 from tests.bundle.cells import cell
 from tests.bundle.slicing import slice_graph
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.clone import clone_graph
+from epypes.bundle.source.clone import clone_graph
 
 
 def times(x, gain=2.0):

@@ -11,7 +11,7 @@ import pytest
 
 import epypes as ep
 from epypes.bundle import verify
-from epypes.bundle.compare import SAFETY, Tolerance, difference, differences, first_difference, read_tolerances
+from epypes.bundle.proof.compare import SAFETY, Tolerance, difference, differences, first_difference, read_tolerances
 from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError, PromotionRefused
 from tests.bundle.test_slicer import notebook

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.compare import first_difference
+from epypes.bundle.proof.compare import first_difference
 from epypes.errors import PromotionRefused
 from tests.bundle.hostile import in_notebook
 

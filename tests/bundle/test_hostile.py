@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.compare import first_difference
 from epypes.bundle.promote import promote_notebook
+from epypes.bundle.proof.compare import first_difference
 from epypes.errors import PromotionRefused, SourceRefused
 from tests.bundle.hostile import IMPORTS, MAGIC, MAGIC_INSIDE, PROMOTED, REFUSED, graph_cell, in_notebook
 

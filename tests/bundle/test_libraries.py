@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import epypes as ep
-from epypes.bundle.compare import first_difference
+from epypes.bundle.proof.compare import first_difference
 from epypes.errors import PromotionRefused
 from tests.bundle.hostile import in_notebook
 

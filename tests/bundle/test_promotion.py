@@ -20,10 +20,10 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify
 from epypes.bundle.adapters import payload_of
-from epypes.bundle.compare import first_difference
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
 from epypes.bundle.promote import promote_notebook
+from epypes.bundle.proof.compare import first_difference
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
 from epypes.graph import colour_order
 from epypes.wire import Envelope

@@ -16,9 +16,9 @@ import skimage.filters
 from skimage.filters import gaussian
 
 import epypes as ep
-from epypes.bundle.module import emit_module
-from epypes.bundle.resolve import Importable, importable
 from epypes.bundle.settings import Settings
+from epypes.bundle.source.module import emit_module
+from epypes.bundle.source.resolve import Importable, importable
 from tests.bundle.slicing import slice_graph
 from tests.seeds import printed
 
@@ -211,7 +211,7 @@ def test_library_functions_have_a_public_name(value, expected):
 
 @pytest.mark.slow
 def test_a_set_has_the_same_source_under_any_hash_seed():
-    code = "from epypes.bundle.expressions import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
+    code = "from epypes.bundle.source.expressions import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
     texts = printed(code, "0123")
     assert texts == {'{"a": ({"w", "x", "y", "z"}, [1], (2,), ())}\n'}
 

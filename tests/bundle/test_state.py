@@ -17,7 +17,7 @@ from epypes.batch.cache import graph_fingerprint
 from epypes.bundle import verify
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
-from epypes.bundle.replay import replay
+from epypes.bundle.proof.replay import replay
 from epypes.bundle.settings import read_settings
 from epypes.bundle.writeback import write_back
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers

@@ -16,7 +16,7 @@ import epypes as ep
 from epypes.bundle import verify
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import recorded_environment, write_manifest
-from epypes.bundle.replay import replay
+from epypes.bundle.proof.replay import replay
 from epypes.errors import BundleError, ReplayDiffers
 from epypes.wire import load_sample, save_sample
 from tests.bundle.test_slicer import notebook

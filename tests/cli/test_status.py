@@ -10,7 +10,7 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.replica_messages import Heartbeat
+from epypes.service.replication.messages import Heartbeat
 from epypes.service.state_file import StateLock
 from epypes.transport import memory
 from tests.service.replicated import publish_to_replicas

@@ -10,7 +10,7 @@ from PIL import Image
 
 import epypes as ep
 from epypes.display import encode_image, view
-from epypes_widgets.frames import picture
+from epypes_widgets.picture.frames import picture
 
 
 def steps(*values: float, dtype: str = "float64") -> np.ndarray:

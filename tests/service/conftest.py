@@ -35,6 +35,6 @@ def acting(tmp_path_factory):
 @pytest.fixture
 def quick(monkeypatch):
     """Services of this process pause only shortly before they start a worker again; each death is an early one."""
-    monkeypatch.setattr("epypes.service.worker_health.RESTART_PAUSE_S", 0.01)
-    monkeypatch.setattr("epypes.service.worker_health._FAULT_PAUSE_S", 0.5)
-    monkeypatch.setattr("epypes.service.worker_health._SOON_S", 60.0)
+    monkeypatch.setattr("epypes.service.supervision.worker_health.RESTART_PAUSE_S", 0.01)
+    monkeypatch.setattr("epypes.service.supervision.worker_health._FAULT_PAUSE_S", 0.5)
+    monkeypatch.setattr("epypes.service.supervision.worker_health._SOON_S", 60.0)

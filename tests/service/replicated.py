@@ -8,7 +8,7 @@ import signal
 from contextlib import contextmanager
 
 import epypes as ep
-from epypes.service.replica_messages import encode_message
+from epypes.service.replication.messages import encode_message
 from epypes.transport.address import parse_address
 from tests.brokers.fleet import fleet
 

@@ -14,8 +14,8 @@ from epypes.display.views.graphview import to_json
 from epypes.display.views.view import view
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError
 from epypes.service.http.server import HttpServer
-from epypes.service.packing import pack
 from epypes.service.parameters import Parameters, changed_entries
+from epypes.service.supervision.packing import pack
 from epypes.wire import Envelope, encode
 
 

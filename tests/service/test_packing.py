@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.errors import MessageError
-from epypes.service.packing import pack, pack_event, unpack, unpack_event
+from epypes.service.supervision.packing import pack, pack_event, unpack, unpack_event
 from epypes.wire import Envelope, encode
 from tests.wire.mutants import mutate_bytes
 

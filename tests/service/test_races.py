@@ -11,8 +11,8 @@ from types import SimpleNamespace
 import pytest
 
 from epypes.errors import RevisionConflict, ServiceError
-from epypes.service.frame_socket import WorkerMessage
-from epypes.service.worker_queries import WorkerQueries
+from epypes.service.supervision.frame_socket import WorkerMessage
+from epypes.service.supervision.worker_queries import WorkerQueries
 from tests.service.bundles import written_bundle
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, gated_bundle, serving, until
 

@@ -17,7 +17,7 @@ from httpx_sse import EventSource
 from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.replica_messages import (
+from epypes.service.replication.messages import (
     MAX_INTEGER,
     Goodbye,
     Heartbeat,
@@ -299,7 +299,7 @@ def test_a_newcomer_has_the_revision_of_the_group_from_its_first_event_on(trio, 
 
 @pytest.mark.slow
 def test_events_do_not_wait_for_ever_for_parameters_that_no_replica_publishes(acting, host, monkeypatch):
-    monkeypatch.setattr("epypes.service.replicas._JOIN_TIMEOUT_S", 1.0)
+    monkeypatch.setattr("epypes.service.replication.replicas._JOIN_TIMEOUT_S", 1.0)
     digest = Service(acting).info()["digest"]
     with line_of(host) as line, Service(acting, line.sub, line.pub) as service:
         boast = Heartbeat("boaster", replica="2", host="elsewhere", digest=digest, revision=1_000, author="boaster")

@@ -14,8 +14,8 @@ import pytest
 import epypes as ep
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
-from epypes.service.frame_socket import WorkerMessage
 from epypes.service.http import HttpServer
+from epypes.service.supervision.frame_socket import WorkerMessage
 from epypes.wire import decode, encode
 from tests.service.processes import running
 from tests.service.served import acting_bundle, event, peer_of, serving, until

@@ -19,7 +19,7 @@ from epypes.errors import (
     UnknownName,
 )
 from epypes.service import Service
-from epypes.service.packing import unpack
+from epypes.service.supervision.packing import unpack
 from epypes.wire import decode
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, peer_of, serving, until
 

@@ -14,8 +14,8 @@ import pytest
 
 from epypes.bundle.manifest import write_manifest
 from epypes.display.views.graphview import from_json
-from epypes.service.frame_socket import WorkerMessage
-from epypes.service.packing import MARK, unpack
+from epypes.service.supervision.frame_socket import WorkerMessage
+from epypes.service.supervision.packing import MARK, unpack
 from epypes.wire import Envelope, decode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of

@@ -10,8 +10,8 @@ import threading
 from contextlib import contextmanager
 from itertools import count
 
-from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
-from epypes.service.packing import unpack
+from epypes.service.supervision.frame_socket import ControlSocket, FrameSocket, WorkerMessage
+from epypes.service.supervision.packing import unpack
 from epypes.wire import Envelope, decode, encode
 
 TIMEOUT_S = 60.0

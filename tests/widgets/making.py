@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import epypes as ep
-from epypes_widgets.controls import Control, controls
+from epypes_widgets.controls.control import Control, controls
 
 
 def runner_of(**values: Any) -> ep.CompGraphRunner:

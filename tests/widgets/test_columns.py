@@ -9,8 +9,8 @@ import ipywidgets
 import pytest
 
 import epypes as ep
-from epypes_widgets.column import Column, column
-from epypes_widgets.controls import controls
+from epypes_widgets.controls.column import Column, column
+from epypes_widgets.controls.control import controls
 
 
 def listed(runner: ep.CompGraphRunner, **hints: Any) -> Column:

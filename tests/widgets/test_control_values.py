@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes.hints import Roi
-from epypes_widgets.column import column
-from epypes_widgets.controls import controls
+from epypes_widgets.controls.column import column
+from epypes_widgets.controls.control import controls
 from tests.widgets.making import at, made, moves, runner_of
 
 

@@ -13,8 +13,8 @@ import pytest
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes.hints import Roi, as_param
-from epypes_widgets.controls import Control, controls
-from epypes_widgets.ranges import ranges
+from epypes_widgets.controls.control import Control, controls
+from epypes_widgets.controls.ranges import ranges
 from tests.widgets.making import at
 
 

@@ -172,7 +172,7 @@ def test_the_runner_has_the_state_after_the_frame_whatever_is_looked_at(smoothin
 
 
 def test_it_says_how_far_it_has_come(smoothing: Smoothing, panel: Panel, screen: FrontEnd, monkeypatch: Any) -> None:
-    monkeypatch.setattr("epypes_widgets.frame_states._REPORT_S", 0.0)
+    monkeypatch.setattr("epypes_widgets.picture.frame_states._REPORT_S", 0.0)
     screen.tell("image", index=30)
     shown(panel)
     texts = [note["text"] for note in screen.of("note")]

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 import epypes as ep
-from epypes_widgets.frames import make_frame
-from epypes_widgets.screen import Comparison, Shown
+from epypes_widgets.picture.frames import make_frame
+from epypes_widgets.picture.screen import Comparison, Shown
 from epypes_widgets.values import json_value
 from tests.colours import red_image, red_runner
 

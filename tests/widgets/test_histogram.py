@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 import epypes as ep
 from epypes.display import Backdrop, reset_display_ranges
 from epypes.display.previews.images import display_range
-from epypes_widgets.histogram import histogram, histogram_of
+from epypes_widgets.picture.histogram import histogram, histogram_of
 
 
 def counted(image: Any, order: Any = "bgr", ends: Any = None) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from PIL import Image
 
 import epypes as ep
 from epypes.errors import PayloadError, UnknownName
-from epypes_widgets.images import payloads
+from epypes_widgets.picture.images import payloads
 from tests.colours import red_image, red_runner
 
 

@@ -11,7 +11,7 @@ import pytest
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes_widgets import Panel, tune
-from epypes_widgets.ranges import ranges
+from epypes_widgets.controls.ranges import ranges
 
 IMAGE = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import epypes as ep
 from epypes.display import Preview, register_preview, scene_of
-from epypes_widgets.frames import overlay, scene
+from epypes_widgets.picture.frames import overlay, scene
 
 
 def run_of(find: Callable[[Any], Any], image: Any = None) -> ep.Run:

@@ -16,7 +16,7 @@ from PIL import Image
 import epypes as ep
 from epypes.errors import SettingsError, UnknownName
 from epypes_widgets import Panel, tune
-from epypes_widgets.picture_settings import PictureSettings, auto_limits
+from epypes_widgets.picture.picture_settings import PictureSettings, auto_limits
 from epypes_widgets.settings import load_pictures, save
 from tests.widgets.frontend import FrontEnd
 

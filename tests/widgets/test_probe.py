@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 import epypes as ep
 from epypes.display import Backdrop, Scene
-from epypes_widgets.stages import probe, stages
+from epypes_widgets.picture.stages import probe, stages
 from tests.colours import red_image, red_runner
 
 SIZE = (40, 30)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
-from epypes_widgets.controls import Control, controls
+from epypes_widgets.controls.control import Control, controls
 from tests.widgets.making import moves, runner_of
 
 BOTH = ep.Param(0, 255, below="hi")

@@ -12,7 +12,7 @@ import pytest
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes.hints import Roi, Text
-from epypes_widgets.ranges import range_text, ranges
+from epypes_widgets.controls.ranges import range_text, ranges
 
 
 def runner_of(function: Callable[..., Any], *inputs: str, **values: Any) -> ep.CompGraphRunner:

@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from epypes_widgets.frames import Frame
+from epypes_widgets.picture.frames import Frame
 from epypes_widgets.view import FrameSender
 from epypes_widgets.worker import Worker
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.stages import best_stage, stages, states
+from epypes_widgets.picture.stages import best_stage, stages, states
 
 
 def blurred(image: Any, sigma: float) -> Any:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets.frames import thumbnail
-from epypes_widgets.static import static_html
+from epypes_widgets.picture.frames import thumbnail
+from epypes_widgets.picture.static import static_html
 from tests.colours import red_image, red_runner
 
 

@@ -15,7 +15,7 @@ import pytest
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes_widgets import Panel, tune
-from epypes_widgets.tiles import change_of, numbers_of
+from epypes_widgets.picture.tiles import change_of, numbers_of
 from tests.widgets.frontend import FrontEnd
 
 TIMEOUT_S = 60

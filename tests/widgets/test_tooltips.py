@@ -10,8 +10,8 @@ import pytest
 from skimage import filters
 
 import epypes as ep
-from epypes_widgets.ranges import ranges
-from epypes_widgets.tooltips import tooltip
+from epypes_widgets.controls.ranges import ranges
+from epypes_widgets.controls.tooltips import tooltip
 
 
 def documented(image: Any, side: int, low: int, high: int, other: int) -> Any:

@@ -16,7 +16,7 @@ import pytest
 import epypes as ep
 from epypes.errors import ImageFileError, PayloadError
 from epypes_widgets import tune
-from epypes_widgets.images import VideoPayloads, payloads
+from epypes_widgets.picture.images import VideoPayloads, payloads
 from tests.colours import red_runner
 from tests.videos import number_in, with_damage, write_video
 

@@ -13,7 +13,7 @@ from functools import reduce
 from operator import or_
 from typing import Any, Final
 
-from epypes.bundle.expressions import bracketed, literal_source
+from epypes.bundle.source.expressions import bracketed, literal_source
 from epypes_widgets.values import differing, listed
 
 # A longer text of one value is for a file, not for a line.

@@ -22,7 +22,7 @@ from epypes.graph.signature import signature_of
 from epypes.hints import Param, Roi, as_param
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array
-from epypes_widgets.ranges import allows
+from epypes_widgets.controls.ranges import allows
 from epypes_widgets.values import is_movable, listed
 
 _ABSENT: Final = object()

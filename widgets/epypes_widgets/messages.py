@@ -16,11 +16,11 @@ from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.cases import Cases
-from epypes_widgets.frames import scene
-from epypes_widgets.picture_settings import auto_limits
+from epypes_widgets.picture.frames import scene
+from epypes_widgets.picture.picture_settings import auto_limits
+from epypes_widgets.picture.screen import Comparison
+from epypes_widgets.picture.stages import probe
 from epypes_widgets.promotion import BundleJob, Outcome
-from epypes_widgets.screen import Comparison
-from epypes_widgets.stages import probe
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.view import Handler, Message
 

@@ -16,19 +16,19 @@ from epypes.run import CompGraphRunner, Run
 from epypes.store import Store
 from epypes_widgets import code, settings
 from epypes_widgets.cases import Cases, read_cases
-from epypes_widgets.column import column
-from epypes_widgets.controls import ControlSet, controls
+from epypes_widgets.controls.column import column
+from epypes_widgets.controls.control import ControlSet, controls
 from epypes_widgets.functions import Made, are_functions, made_runner
 from epypes_widgets.history import StoredHistory, history_of
-from epypes_widgets.images import Payloads, payloads
 from epypes_widgets.messages import Messages
-from epypes_widgets.picture_settings import PictureSettings
+from epypes_widgets.picture.images import Payloads, payloads
+from epypes_widgets.picture.picture_settings import PictureSettings
+from epypes_widgets.picture.screen import Screen
+from epypes_widgets.picture.static import Displayed, StaticOutput, static_html
+from epypes_widgets.picture.tiles import Tiles
 from epypes_widgets.promotion import proposal
-from epypes_widgets.screen import Screen
 from epypes_widgets.search import Search
 from epypes_widgets.session import Session, tunable
-from epypes_widgets.static import Displayed, StaticOutput, static_html
-from epypes_widgets.tiles import Tiles
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.values import json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell

@@ -15,7 +15,7 @@ from epypes.batch.grid import identity
 from epypes.batch.mapping import SweepResult
 from epypes.display.text import cut
 from epypes.errors import EpypesError
-from epypes_widgets.static import Displayed, StaticOutput
+from epypes_widgets.picture.static import Displayed, StaticOutput
 from epypes_widgets.values import is_same, setting_text
 from epypes_widgets.view import script, styles, use_subshell
 from epypes_widgets.worker import Worker

@@ -16,8 +16,8 @@ from operator import is_, is_not
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from epypes.run import CompGraphRunner, Run
-from epypes_widgets.frame_states import FrameStates
-from epypes_widgets.images import Payloads, is_alike
+from epypes_widgets.picture.frame_states import FrameStates
+from epypes_widgets.picture.images import Payloads, is_alike
 
 if TYPE_CHECKING:
     from epypes.service.remote.runner import RemoteRunner

@@ -16,8 +16,8 @@ from epypes.catalog import plain
 from epypes.errors import SettingsError, UnknownName
 from epypes.hints import Param
 from epypes.optional import optional_import
-from epypes_widgets.picture_settings import PictureSettings
-from epypes_widgets.ranges import range_text
+from epypes_widgets.controls.ranges import range_text
+from epypes_widgets.picture.picture_settings import PictureSettings
 from epypes_widgets.values import numpy_type
 
 FORMAT: Final = "epypes settings 1"

@@ -17,11 +17,11 @@ from typing import Any, Final
 from epypes.errors import NotComputed, StillRunning
 from epypes.graph import subgraph
 from epypes.run import Failure, Run
-from epypes_widgets.controls import ControlSet
-from epypes_widgets.frame_states import Superseded
-from epypes_widgets.frames import thumbnail
+from epypes_widgets.controls.control import ControlSet
 from epypes_widgets.history import Entry, History
-from epypes_widgets.screen import Comparison, Screen
+from epypes_widgets.picture.frame_states import Superseded
+from epypes_widgets.picture.frames import thumbnail
+from epypes_widgets.picture.screen import Comparison, Screen
 from epypes_widgets.session import Session
 from epypes_widgets.values import is_same, short_text
 from epypes_widgets.worker import Worker

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from epypes.bundle.arrays import StoredArray
 from epypes.bundle.settings import decode_value
-from epypes.service.packing import unpack_state
+from epypes.service.supervision.packing import unpack_state
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"

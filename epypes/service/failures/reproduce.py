@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.bundle.manifest import MODULE
 from epypes.errors import BundleError, EpypesError
 from epypes.service.failures.record import FailedEvent, read_record, state_of, values_of, with_id
-from epypes.service.worker_connection import signal_name
+from epypes.service.supervision.worker_connection import signal_name
 
 if TYPE_CHECKING:
     from epypes.pipeline import FullPipeline
@@ -105,7 +105,7 @@ def reproduce(
     BundleError
         The bundle is not what was promoted, or its module fails.
     """
-    from epypes.service.packing import pack_event
+    from epypes.service.supervision.packing import pack_event
 
     with tempfile.TemporaryDirectory(prefix="epypes-replay-") as name:
         scratch = Path(name)
@@ -179,7 +179,7 @@ def main(arguments: list[str]) -> int:
         text = str(error) if isinstance(error, EpypesError) else f"{folder} fails: {type(error).__name__}: {error}"
         _write_outcome(scratch, {"refused": text})
         return 1
-    from epypes.service.packing import unpack_event
+    from epypes.service.supervision.packing import unpack_event
 
     event = unpack_event((scratch / _EVENT).read_bytes())
     # Its thread does not need the GIL: it shows the line also while a C function holds that.

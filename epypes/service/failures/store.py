@@ -192,7 +192,7 @@ class FailureStore:
 
     def _packed(self, event: Any, state: bytes) -> tuple[bytes | None, str]:
         """Return the state and the event as bytes, or None and the reason."""
-        from epypes.service.packing import pack_event
+        from epypes.service.supervision.packing import pack_event
 
         if event is None:
             return None, "the service had none to give"
@@ -315,7 +315,7 @@ class FailureStore:
         UnknownName, FailureNotKept
             As `packed_event`.
         """
-        from epypes.service.packing import unpack_event
+        from epypes.service.supervision.packing import unpack_event
 
         packed = self.packed_event(failure_id)
         try:

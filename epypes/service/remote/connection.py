@@ -174,7 +174,7 @@ class Connection:
 
     def envelope(self, tokens: str | Sequence[str], revision: int | None = None) -> Envelope:
         """Return what ``run`` does as the service sends it: with its revision, event and times."""
-        from epypes.service.packing import unpack
+        from epypes.service.supervision.packing import unpack
         from epypes.wire import decode
 
         names = [tokens] if isinstance(tokens, str) else list(tokens)
@@ -197,7 +197,7 @@ class Connection:
 
     def failure(self, failure_id: str) -> tuple[FailedEvent, Envelope | bytes | None]:
         """Return the record of an event that failed, and the event; None if it was not kept."""
-        from epypes.service.packing import unpack_event
+        from epypes.service.supervision.packing import unpack_event
 
         path = f"/v1/failures/{quote(failure_id, safe='')}"
         record = self._record(self._control.get(path))

@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Final
 
 from epypes.bundle.load import Bundle, read_bundle
-from epypes.bundle.replay import replay
+from epypes.bundle.proof.replay import replay
 from epypes.errors import EpypesError
 from epypes.pipeline import Pipeline
 from epypes.run import Failure
-from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
+from epypes.service.supervision.frame_socket import ControlSocket, FrameSocket, WorkerMessage
 from epypes.service.worker.inputs import FRONT_GONE, Inputs, not_understood
 from epypes.service.worker.run_queries import QueryAnswerer
 from epypes.service.worker.slots import Slot, SlotParameters

@@ -16,7 +16,7 @@ from time import sleep
 from typing import Any, Final, NoReturn
 
 from epypes.errors import MessageError
-from epypes.service.frame_socket import FrameSocket, WorkerMessage
+from epypes.service.supervision.frame_socket import FrameSocket, WorkerMessage
 
 NOT_UNDERSTOOD: Final = 2
 FRONT_GONE: Final = 3

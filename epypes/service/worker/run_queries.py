@@ -17,8 +17,8 @@ from weakref import ref
 from epypes.errors import EpypesError, MessageError, NotComputed, UnknownName
 from epypes.graph import colour_order
 from epypes.run import CompGraphRunner, Run
-from epypes.service.frame_socket import FrameSocket, WorkerMessage
-from epypes.service.packing import BytesLike, pack
+from epypes.service.supervision.frame_socket import FrameSocket, WorkerMessage
+from epypes.service.supervision.packing import BytesLike, pack
 from epypes.wire import Envelope, encode
 from epypes.wording import error_message
 

@@ -24,8 +24,8 @@ from epypes.bundle.settings import Member, decode_value
 from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline
 from epypes.run import Failure, Run
-from epypes.service.frame_socket import FrameSocket, WorkerMessage
-from epypes.service.packing import BytesLike, pack_state
+from epypes.service.supervision.frame_socket import FrameSocket, WorkerMessage
+from epypes.service.supervision.packing import BytesLike, pack_state
 from epypes.service.worker.inputs import Inputs
 from epypes.service.worker.run_queries import CompletedRun, QueryAnswerer
 from epypes.service.worker.states import State, WorkerStates

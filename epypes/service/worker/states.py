@@ -12,11 +12,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import MessageError
-from epypes.service.packing import BytesLike, pack_state, unpack_state
+from epypes.service.supervision.packing import BytesLike, pack_state, unpack_state
 
 if TYPE_CHECKING:
     from epypes.pipeline import Pipeline
-    from epypes.service.frame_socket import WorkerMessage
+    from epypes.service.supervision.frame_socket import WorkerMessage
 
 # The values by key, as `CompGraphRunner.state`; None for the initial state.
 State = Mapping[str, Any] | None

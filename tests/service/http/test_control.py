@@ -16,7 +16,7 @@ from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.packing import unpack, unpack_event
+from epypes.service.supervision.packing import unpack, unpack_event
 from epypes.wire import Envelope, decode
 from tests.service.http.raw import until
 from tests.service.served import acting_bundle, peer_of

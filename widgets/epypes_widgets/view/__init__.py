@@ -27,7 +27,7 @@ from typing import Any, Final
 import anywidget
 import ipywidgets
 
-from epypes_widgets.frames import Frame
+from epypes_widgets.picture.frames import Frame
 from epypes_widgets.worker import Worker
 
 # Longer than any screen takes to paint; a screen that is gone costs a frame every half minute.

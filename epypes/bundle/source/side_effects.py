@@ -1,0 +1,369 @@
+"""Static checks that name the line: writes to state that outlives a call, monkeypatches, and what only a notebook has.
+
+What syntax can't see is found by the replays, by the comparison of libraries with those of a fresh process, and by the
+snapshot that guards the functions of a loaded bundle.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import inspect
+import re
+import sys
+import types
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
+from typing import Any, Final
+
+from epypes.bundle.private_import import loaded_module
+from epypes.bundle.proof.process_settings import SETTINGS
+from epypes.bundle.source.references import global_names, module_of_import, namespace_of
+from epypes.bundle.source.resolve import (
+    Definition,
+    Refused,
+    definition_of,
+    evaluated,
+    executed_cells,
+    is_of_notebook,
+    parsed,
+    place_in,
+)
+from epypes.run.guard import is_plain_array
+from epypes.wording import keep_as_state
+
+# By module or class of a library and the name there: the place in the notebook that changes it.
+Patches = Mapping[tuple[Any, str], str]
+
+# -- writes to what outlives a call ----------------------------------------------------------------------------------
+
+# What begins as a literal of its type without content.
+_EMPTY: Final = frozenset({bool, int, float, str, list, dict, tuple})
+# Methods of lists, dicts, sets, deques and arrays that change them.
+CHANGING: Final = frozenset(
+    {
+        *("append", "appendleft", "extend", "extendleft", "insert", "pop", "popleft", "popitem", "remove", "clear"),
+        *("update", "setdefault", "add", "discard", "sort", "reverse", "fill", "itemset", "put", "resize"),
+        *("difference_update", "intersection_update", "symmetric_difference_update", "setfield", "setflags"),
+    }
+)
+
+
+def check_state(found: Definition) -> None:
+    """Refuse a definition of the notebook that changes something outside of it, or has a decorator that does."""
+    for decorator, wrapper in found.wrappers:
+        called = decorator.func if isinstance(decorator, ast.Call) else decorator
+        what = f"{found.what} is wrapped by a decorator, @{ast.unparse(decorator)} ({found.place_in(decorator)}):"
+        for function in (evaluated(called, found.names), wrapper):
+            node = definition_of(function.__code__)[1] if is_of_notebook(function) else None
+            if node is not None:
+                _check_writes(node, function.__code__.co_filename, function, f"{what} {function.__code__.co_name!r}")
+    _check_writes(found.node, found.file, found.function, found.what)
+
+
+def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None, what: str) -> None:
+    """Refuse writes to names and objects from outside of a function; of a class, to global names alone."""
+    outside, names = set[str](), dict[str, Any]()
+    if function is not None:
+        names = namespace_of(function)
+        outside = {*function.__code__.co_freevars, *global_names(function.__code__)}
+    parts = [*ast.walk(node)]
+    stored = {part.id: part for part in parts if isinstance(part, ast.Name) and not isinstance(part.ctx, ast.Load)}
+    for part in parts:
+        if isinstance(part, ast.Global | ast.Nonlocal):
+            for name in filter(stored.__contains__, part.names):
+                if isinstance(part, ast.Global):
+                    place = place_in(file, stored[name].lineno)
+                    raise Refused(f"{what} changes the global {name!r} ({place}). Return it. {_as_state(name, names)}")
+                if name in outside:
+                    text = f"{what} changes {name!r} of the function around it ({place_in(file, part.lineno)})"
+                    raise Refused(f"{text}: the next call would find it different. Return it. {_as_state(name, names)}")
+        for written in _written(part):
+            name = _root(written)
+            is_plain = isinstance(getattr(written, "ctx", None), ast.Store | ast.Del)
+            if name in outside and (is_plain or _is_container(written, names)):
+                text = f"{what} writes into {name!r}, which outlives the call ({place_in(file, written.lineno)})"
+                text = f"{text}: the next event would find it different. Write into a copy of it."
+                raise Refused(f"{text} {_as_state(name, names)}")
+
+
+def _as_state(name: str, names: Mapping[str, Any]) -> str:
+    """Return how to keep the value of a name from event to event; it begins empty, as it most likely did."""
+    value = names.get(name)
+    kind: type[Any] = type(value)
+    return f"{keep_as_state(name, repr(kind()) if kind in _EMPTY else 'None')}."
+
+
+def _written(node: ast.AST) -> Iterator[ast.expr]:
+    """Give the expressions whose objects a part of a program writes into, if they are containers or attributes."""
+    if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
+        yield node
+    if isinstance(node, ast.Call):
+        yield from _attribute_of(node, "setattr", "delattr")
+        yield from (part.value for part in node.keywords if part.arg in ("out", "dst"))
+        if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
+            yield node.func.value
+
+
+def _attribute_of(node: ast.AST, *functions: str) -> Iterator[ast.expr]:
+    """Give the attribute that getattr, setattr or delattr is called with."""
+    if isinstance(node, ast.Call) and getattr(node.func, "id", "") in functions and len(node.args) > 1:
+        attribute = ast.Attribute(node.args[0], str(getattr(node.args[1], "value", "")), ast.Store())
+        yield ast.copy_location(attribute, node)
+
+
+def _is_container(node: ast.expr, names: Mapping[str, Any]) -> bool:
+    """Whether an expression is of a kind that is written into; of no dotted name, whether that which it is of is."""
+    value = evaluated(node, names)
+    value = names.get(_root(node)) if value is None else value
+    return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
+
+
+def _root(node: ast.expr) -> str:
+    """Return the name of what a subscript or attribute is of; "" if that is no name."""
+    while isinstance(node, ast.Subscript | ast.Attribute):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+# -- what only a notebook has ----------------------------------------------------------------------------------------
+
+_NAMES_OF_NOTEBOOKS: Final = {
+    "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
+    "display": "which shows something in the notebook; a service shows nothing. Return it as a token",
+    "input": "which asks a person. Make the answer a token",
+    "breakpoint": "which waits for a person. Leave it out",
+    "globals": "all names of the notebook. Use those that you need by name",
+    "exit": "which ends the notebook. Raise an exception",
+    "quit": "which ends the notebook. Raise an exception",
+    "In": "the notebook's cells. Make the text a token",
+    "Out": "what the notebook's cells have shown. Make the value a token",
+    "eval": "which may use any name. Write what it evaluates",
+    "exec": "which may use any name. Write what it runs",
+    "__import__": "which imports what no statement says. Write an import statement",
+} | dict.fromkeys(
+    ("__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"),
+    "which is another one in a bundle. Write the value itself, or make it a token",
+)
+
+
+def check_notebook_name(name: str, found: Definition) -> None:
+    """Refuse a name that means something in a notebook alone."""
+    if name in _NAMES_OF_NOTEBOOKS and not is_of_notebook(found.names.get(name)):
+        raise Refused(f"{found.what} uses {name!r} ({found.place_of(name)}), {_NAMES_OF_NOTEBOOKS[name]}.")
+
+
+# By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
+_REFLECTING: Final = (
+    *(builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack),
+    *(inspect.getfile, inspect.getmodule, inspect.getsource, inspect.getsourcefile, inspect.getsourcelines),
+)
+_REFLECTING_ATTRIBUTES: Final = frozenset(
+    {"__globals__", "__builtins__", "__subclasses__", "f_globals", "f_locals", "f_builtins", "f_back", "f_lineno"}
+    | {"tb_lineno", "co_filename", "co_firstlineno", "__firstlineno__", "co_name", "co_qualname"}
+)
+
+
+def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that reads the notebook's names otherwise than by name."""
+    for node in ast.walk(found.node):
+        for read in (node, *_attribute_of(node, "getattr")):
+            value = evaluated(read, names) if isinstance(read, ast.Name | ast.Attribute) else None
+            is_main = isinstance(read, ast.Constant) and read.value == "__main__"
+            is_reflecting = any(value is one for one in _REFLECTING)
+            if is_main or is_reflecting or getattr(read, "attr", "") in _REFLECTING_ATTRIBUTES:
+                text = f"{found.what} uses {ast.unparse(read)!r} ({found.place_in(node)}), by which it reaches"
+                raise Refused(f"{text} what no name in it says. Use what you need by its name, or make it a token.")
+
+
+# Functions of Python's library that set something for the whole process are called like this, but for those that
+# begin in the same way; functions of other libraries that do.
+_SETTER: Final = re.compile(r"(un)?register|set(?!$|attr|item|_blocking)|disable|enable|umask$|tzset$")
+_SETTERS: Final = (
+    *(("cv2.ocl", "setUseOpenCL"), ("cv2.ipp", "setUseIPP"), ("numpy", "setbufsize"), ("numpy", "seterrcall")),
+    *(("scipy.fft", "set_global_backend"), ("sklearn", "set_config")),
+)
+
+
+def _sets_process(value: Any) -> bool:
+    """Whether a function sets for the whole process what the comparison of its settings doesn't read."""
+    if not isinstance(value, types.FunctionType | types.BuiltinFunctionType | types.MethodType):
+        return False
+    home, name = str(value.__module__).lstrip("_"), value.__name__
+    owner = getattr(value, "__self__", None)
+    is_plain = owner is None or isinstance(owner, types.ModuleType) or name == "register"
+    is_of_python = home.partition(".")[0] in sys.stdlib_module_names and home not in {one.module for one in SETTINGS}
+    is_setter = is_of_python and is_plain and _SETTER.match(name) is not None
+    return is_setter or any(value is getattr(sys.modules.get(home), name, None) for home, name in _SETTERS)
+
+
+def _check_setters(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that calls a function which sets something for the whole process."""
+    # What decorators register is there when the module has been imported.
+    for node in ast.walk(ast.Module([*found.node.body], [])):
+        for read in (node, *_attribute_of(node, "getattr")):
+            if isinstance(read, ast.Name | ast.Attribute) and _sets_process(evaluated(read, names)):
+                raise _setter(found.what, f"{ast.unparse(read)!r} ({found.place_in(node)})")
+
+
+def _check_mocks(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition that patches by ``unittest.mock`` but in a 'with' statement, which undoes it."""
+    parts = [*ast.walk(ast.Module([*found.node.body], []))]
+    calls = [item.context_expr for part in parts if isinstance(part, ast.With) for item in part.items]
+    undone = {id(part) for call in calls if isinstance(call, ast.Call) for part in ast.walk(call.func)}
+    for node in parts:
+        value = evaluated(node, names) if isinstance(node, ast.Name | ast.Attribute) else None
+        is_patch = getattr(value, "__module__", "") == "unittest.mock" and "patch" in getattr(value, "__name__", "")
+        if is_patch and id(node) not in undone:
+            text = f"{found.what} uses {ast.unparse(node)!r} ({found.place_in(node)}) outside of a 'with' statement"
+            raise Refused(f"{text}, so that later events may find it patched. Write: with {ast.unparse(node)}(...):")
+
+
+def _setter(what: str, name: str) -> Refused:
+    text = f"{what} uses {name}, which sets something for the whole process, for later events and other threads too"
+    return Refused(f"{text}. Do it in the notebook if no result depends on it, or leave it out.")
+
+
+# -- monkeypatches ---------------------------------------------------------------------------------------------------
+
+
+def check_reads(found: Definition, known: Patches) -> None:
+    """Refuse a definition that reads by reflection, or what the notebook has changed in a library's module or class."""
+    names = {**sys.modules, **found.names, **imported_by(found)}
+    _check_reflection(found, names)
+    _check_setters(found, names)
+    _check_mocks(found, names)
+    # A module or class by itself, as in getattr(module, name), may be asked for any name.
+    dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
+    changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
+    for node in ast.walk(found.node):
+        if isinstance(node, ast.Name | ast.Attribute) and id(node) not in dotted:
+            owner, name, place = changed.get(id(evaluated(node, names)), (None, "", ""))
+            if owner is not None:
+                raise _patched(found.what, f"{owner.__name__}.{name}", place)
+    of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
+    home = loaded_module(str(found.names.get("__name__")))
+    for owner, name in (*_read_by(found.node, names), *((home, name) for name in found.reads())):
+        if not isinstance(owner, types.ModuleType):  # the class of an object can't be seen
+            owner, name = of_classes.get(name, (None, name))
+        place = _place_of_patch(known, owner, name, found.place_in(found.node))
+        if place:
+            raise _patched(found.what, name if owner is builtins else f"{owner.__name__}.{name}", place)
+
+
+def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
+    """Refuse an object that can be imported only as the notebook has changed it."""
+    name = qualname.partition(".")[0]
+    if _sets_process(getattr(loaded_module(module), name, None)):
+        raise _setter(what, repr(f"{module}.{qualname}"))
+    place = _place_of_patch(known, loaded_module(module), name, "by a name that no text has")
+    if place:
+        raise _patched(what, f"{module}.{qualname}", place)
+
+
+def _patched(what: str, name: str, place: str) -> Refused:
+    text = f"{what} uses {name!r}, which the notebook has changed ({place}); a service has it as it was installed"
+    return Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
+
+
+def imported_by(found: Definition) -> dict[str, Any]:
+    """Return what a definition imports itself, by name; refuse the notebook as a module."""
+    names: dict[str, Any] = {}
+    for node in (node for node in ast.walk(found.node) if isinstance(node, ast.Import | ast.ImportFrom)):
+        for alias in node.names:
+            try:
+                source = module_of_import(node, alias, found.names)
+            except ImportError:  # the function raises the same when it is called
+                continue
+            if "__main__" in (source, alias.name):
+                text = f"{found.what} imports the notebook itself, as '__main__' ({found.place_in(node)})"
+                raise Refused(f"{text}. Use what it has by its own name, without the module.")
+            module = loaded_module(source)
+            part = getattr(module, alias.name, loaded_module(f"{source}.{alias.name}"))
+            names[alias.asname or alias.name] = part if isinstance(node, ast.ImportFrom) else module
+    return names
+
+
+def _place_of_patch(known: Patches, owner: Any, name: str, otherwise: str) -> str:
+    """Return where the notebook has changed what a module or class has; "" if it has not, ``otherwise`` if unknown."""
+    return known.get((owner, name), "") or (otherwise if _is_patched(owner, name) else "")
+
+
+def _is_patched(owner: Any, name: str) -> bool:
+    """Whether a module has a function, class or mock of the notebook, in whatever way that was put there."""
+    value = vars(owner).get(name) if isinstance(owner, types.ModuleType) and owner.__name__ != "__main__" else None
+    is_own = isinstance(value, types.FunctionType) and value.__globals__.get("__name__") == "__main__"
+    is_mocks = isinstance(owner, types.ModuleType) and owner.__name__ == "unittest.mock"
+    homes = () if is_mocks else (getattr(value, "__module__", ""), type(value).__module__)
+    return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
+
+
+def patches_in_notebook() -> Patches:
+    """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
+    return patches_in(_cells(), vars(sys.modules["__main__"]))
+
+
+def patches_in(texts: Iterable[tuple[str, str]], names: Mapping[str, Any]) -> Patches:
+    """Return what texts change in libraries; each comes with its name in a place, and ``names`` are what it reads."""
+    found = dict[tuple[Any, str], str]()
+    for cell, text in texts:
+        for written in _written_in(text):
+            node = written
+            while isinstance(node, ast.Attribute | ast.Subscript):
+                owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
+                is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
+                is_of_library |= isinstance(owner, types.ModuleType)
+                if isinstance(node, ast.Attribute) and node.attr and is_of_library:
+                    found[owner, node.attr] = f"{cell}, line {written.lineno}"
+                    break
+                node = node.value
+    return found
+
+
+def _cells() -> Iterator[tuple[str, str]]:
+    """Give the text of each cell that was executed, or of the script, after its name in a place."""
+    names = vars(sys.modules["__main__"])
+    script = str(names.get("__file__") or "")
+    return ((f"cell [{cell}]" if cell else script, text) for cell, text in executed_cells(names, script))
+
+
+@lru_cache(maxsize=512)  # every function of a graph asks for every cell
+def _written_in(text: str) -> list[ast.expr]:
+    tree = parsed(text)
+    return [written for node in ast.walk(tree) for written in _written(node)] if tree else []
+
+
+def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:
+    """Give the attributes that a definition reads, also by an import or by getattr, each with what it reads it of."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            yield from ((sys.modules.get(node.module or ""), alias.name) for alias in node.names)
+        for read in (node, *_attribute_of(node, "getattr")):
+            if isinstance(read, ast.Attribute):
+                yield evaluated(read.value, names), read.attr
+            elif isinstance(read, ast.Name):
+                yield builtins, read.id
+
+
+def places_of_change() -> tuple[dict[str, str], dict[str, str]]:
+    """Return the last places in the cells that may have changed attributes of libraries, and that call functions.
+
+    The first are by the names of attributes, to which something is assigned or which a text or keyword names; the
+    second by the names of the functions.
+    """
+    named: dict[str, str] = {}
+    called: dict[str, str] = {}
+    for cell, text in _cells():
+        tree = parsed(text)
+        nodes: list[Any] = [*ast.walk(tree)] if tree else []
+        read = {id(node.slice) for node in nodes if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load)}
+        calls = [node for node in nodes if isinstance(node, ast.Call)]
+        read |= {id(argument) for call in calls if getattr(call.func, "id", "") == "getattr" for argument in call.args}
+        called |= {getattr(call.func, "attr", ""): f"{cell}, line {call.lineno}" for call in calls}
+        for node in nodes:
+            is_written = isinstance(node, ast.Attribute) and not isinstance(node.ctx, ast.Load)
+            name = getattr(node, "attr" if is_written else "arg" if isinstance(node, ast.keyword) else "value", None)
+            if isinstance(name, str) and id(node) not in read:
+                named[name.rpartition(".")[2]] = f"{cell}, line {node.lineno}"
+    return named, called

@@ -1,0 +1,1 @@
+"""Worker processes as the service sees them: started, fed, watched and asked."""

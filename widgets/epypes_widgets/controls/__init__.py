@@ -1,0 +1,1 @@
+"""The controls column of the panel: a control per hyperparameter."""
