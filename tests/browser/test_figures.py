@@ -156,6 +156,19 @@ def test_nothing_in_the_picture_of_an_untrusted_notebook_runs_when_a_trusted_one
     assert sheet.page.evaluate("typeof hit") == "undefined"
 
 
+@pytest.mark.parametrize(("tag", "is_asked"), [("div", False), ("script type=application/json", True)])
+def test_a_kernel_is_asked_only_where_a_script_says_how(sheet: Sheet, edges: str, tag: str, is_asked: bool) -> None:
+    settings = f'<{tag} id="jupyter-config-data">{{"baseUrl": "http://127.0.0.1:9/"}}</{tag.split()[0]}>'
+    asked: list[str] = []
+    sheet.page.on("websocket", lambda socket: asked.append(socket.url))
+    sheet.put(settings, edges.replace('class="epypes-sheet"', 'class="epypes-sheet" data-run="kernel/run"', 1))
+    sheet.page.hover("#token-edges")
+    sheet.page.wait_for_function(
+        "what => document.querySelector('.epypes-card small')?.textContent === what", arg=KEPT_NOTE
+    )
+    assert bool(asked) == is_asked
+
+
 # -- cards ------------------------------------------------------------------------------------------------------------
 
 

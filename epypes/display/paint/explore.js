@@ -353,7 +353,8 @@
   // where no server of Jupyter's is behind the page. The address is "kernel/run". The request is one to execute nothing
   // and to evaluate an expression, so its answer comes over this connection alone.
   function kernelOf(address) {
-    const settings = document.getElementById("jupyter-config-data");
+    // Outputs of notebooks that are not trusted may have any id, but no scripts.
+    const settings = document.querySelector("script#jupyter-config-data");
     if (!address || !settings) return null;
     const unique = () => `${Date.now().toString(36)}-${Math.random().toString(36).slice(2)}`;
     const [id, run] = address.split("/"), session = unique();
