@@ -336,14 +336,21 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
         if param.choices is None and not _is_number(plain(present[token])):
             text = f"{token!r} is {present[token]!r:.60}, so it has no range of numbers."
             raise ScaleError(f"{text} Give a list of choices: ranges={{{token!r}: [...]}}.")
-    return tuple(axis_of(runner, token, params[token]) for token in runner.cg.source_tokens if token in params)
+    return tuple(
+        axis_of(runner, token, params[token]) for token in _in_graph_order(present, runner.cg) if token in params
+    )
+
+
+def _in_graph_order(hyperparameters: Iterable[str], cg: CompGraph) -> list[str]:
+    """Return the graph's own hyperparameters in its order, then those of pipelines in it."""
+    places = {token: place for place, token in enumerate(cg.source_tokens)}
+    return sorted(hyperparameters, key=lambda token: places.get(token, len(places)))
 
 
 def _hinted_axes(runner: CompGraphRunner) -> Iterator[Axis]:
-    for token in runner.cg.source_tokens:
-        if token not in runner.hyperparameters:
-            continue
-        value = runner.hyperparameters[token]
+    present = runner.hyperparameters
+    for token in _in_graph_order(present, runner.cg):
+        value = present[token]
         param = range_of(runner.cg, token, value)
         if param is None and isinstance(value, bool | enum.Enum):
             param = param_from_value(value)

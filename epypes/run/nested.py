@@ -56,7 +56,7 @@ def call_nested(step: Step, nested: NestedSlots, values: list[Any], *args: Any) 
     runner, keys, before = nested.runner, nested.keys, values[nested.run]
     count, is_known = len(args) - len(keys), type(before) is NestedRun
     new = [place for place, slot in enumerate(step.inputs) if slot in before.new] if is_known else []
-    is_known = is_known and all(place < count for place in new)
+    is_known = is_known and before.run.tokens.program is runner._program and all(place < count for place in new)
     entries = {token: values[slot] for token, slot in nested.hparams.items() if values[slot] is not NOT_COMPUTED}
     hparams = runner.current.with_entries(entries)
     loan = Loan(hparams, args[:count], before.run if is_known else None, new)
@@ -85,7 +85,7 @@ def tokens_inside(tokens: TokenManager, function: str) -> tuple[Run, TokenManage
     kept = tokens.values[nested.run] if nested is not None else None
     if nested is None or type(kept) is not NestedRun:
         return None
-    inner, old = nested.runner._program, kept.run.hparams.entries
+    inner, old = kept.run.tokens.program, kept.run.hparams.entries
     now = {token: tokens.values[slot] for token, slot in nested.hparams.items()}
     new = {token: entry for token, entry in now.items() if entry is not NOT_COMPUTED and entry is not old.get(token)}
     found = kept.run.tokens.branch({token: entry[0] if token in inner.slots else entry for token, entry in new.items()})

@@ -88,8 +88,8 @@ class NestedSlots(NamedTuple):
 
     Attributes
     ----------
-    runner
-        The pipeline's own.
+    pipeline
+        The function.
     names
         By hyperparameter token of the pipeline, its name in the graph: ``"function__token"``, as in scikit-learn.
     hparams
@@ -102,12 +102,18 @@ class NestedSlots(NamedTuple):
         Whether its own value is one token as it is.
     """
 
-    runner: CompGraphRunner
+    pipeline: Any
     names: Mapping[str, str]
     hparams: Mapping[str, int]
     run: int
     keys: tuple[str, ...]
     single: bool
+
+    @property
+    def runner(self) -> CompGraphRunner:
+        """The pipeline's own, which may be replaced."""
+        found: CompGraphRunner = getattr(self.pipeline, RUNNER)
+        return found
 
 
 class StateSlots(NamedTuple):
@@ -354,7 +360,7 @@ def _with_nested_slots(steps: Iterable[Step], tokens: list[str], states: list[St
             single=step.single and not own,
             is_plain=False,
             nested=NestedSlots(
-                runner, names, hparams, new_slot(f"the run of {step.name}"), tuple(initial), step.single
+                step.function, names, hparams, new_slot(f"the run of {step.name}"), tuple(initial), step.single
             ),
         )
 

@@ -180,10 +180,10 @@ class CompGraphRunner(OldNames, TokenMapping):
         """Run with what a graph has lent to the pipeline of this one, on from its last call."""
         __tracebackhide__ = True
         hparams, before, is_passed_on = loan.hparams, loan.before, loan.is_passed_on(payload)
-        if before is not None and is_passed_on:
+        if before is not None and is_passed_on and [*before.hparams.free_slots] == [*payload]:
             changes = dict(hparams.changes_since(before.hparams))
-            changes |= {token: value for place, (token, value) in enumerate(payload.items()) if place in loan.new}
-            tokens = before.tokens.branch(changes)
+            new = {token: value for place, (token, value) in enumerate(payload.items()) if place in loan.new}
+            tokens = before.tokens.branch(changes | new, unsure=new)
             del before
         else:
             tokens = hparams.tokens(payload, self._kept)
@@ -230,8 +230,7 @@ class CompGraphRunner(OldNames, TokenMapping):
             first = self._hparams.current if self._program.nested else self._hparams
             last = self.last
             hparams = first.frozen(changes, also_new=False)
-            if not is_trial:
-                self._hparams = hparams
+            self._hparams = first if is_trial else hparams
         if last is None:
             free = self.free_source_tokens
             raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first.")
@@ -373,7 +372,8 @@ class CompGraphRunner(OldNames, TokenMapping):
         if key is not self._key:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
         with self._series, self._lock:
-            is_as_it_was = before is self._hparams and (None if last is None else last()) is self.last
+            now = self._hparams.current if self._program.nested else self._hparams
+            is_as_it_was = before is now and (None if last is None else last()) is self.last
             if not is_as_it_was or kept is not self._kept:
                 return False
             self._hparams, self.last, self._kept = run.hparams, run, self._kept_after(run)

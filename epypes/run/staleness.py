@@ -7,7 +7,7 @@ The cost does not depend on the size of the values.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -152,7 +152,13 @@ class TokenManager(OldNames):
 
     # -- while functions run ------------------------------------------------------------------------------------
 
-    def branch(self, changes: Mapping[str, Any] = MappingProxyType({}), *, are_new: bool = False) -> TokenManager:
+    def branch(
+        self,
+        changes: Mapping[str, Any] = MappingProxyType({}),
+        *,
+        are_new: bool = False,
+        unsure: Collection[str] = (),
+    ) -> TokenManager:
         """Return tokens for a run that goes on from these; what reads a changed one is dirty when that has begun.
 
         Parameters
@@ -161,6 +167,8 @@ class TokenManager(OldNames):
             New values of source tokens.
         are_new
             Whether it is known that they differ from the present ones.
+        unsure
+            The tokens whose arrays may have been written to since, so that one and the same array counts as new.
         """
         program, values, origin = self.program, self.values.copy(), bytes(self.dirty)
         branch = new_tokens().fill(program, values, origin, self.has_payload, origin)
@@ -171,7 +179,10 @@ class TokenManager(OldNames):
         slots = program.settable
         if not are_new:
             old = {token: values[slots[token]] for token in changes}
-            is_new = [not is_unchanged(old[token], value, (), program.guard) for token, value in changes.items()]
+            is_new = [
+                not is_unchanged(old[token], value, (), program.guard and token not in unsure)
+                for token, value in changes.items()
+            ]
             changes = dict(itertools.compress(changes.items(), is_new))
         for token, value in changes.items():
             values[slots[token]] = value

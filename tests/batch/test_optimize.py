@@ -73,6 +73,22 @@ def test_good_values_are_found_and_the_runner_is_left_as_it_was(runner: ep.CompG
     assert runner.run(x=0)["score"] == result.best_value
 
 
+@pytest.mark.parametrize("ranges", [None, {"p__k": (0, 20)}, {"p__k": (0, 20), "g": (0, 3)}])
+def test_what_is_in_pipelines_is_searched_too(ranges: Any) -> None:
+    def inside(x: int, k: Annotated[int, ep.Param(0, 20)]) -> int:
+        return x - (k - 7) ** 2
+
+    def around(b: int, g: Annotated[int, ep.Param(0, 3)]) -> int:
+        return b + g
+
+    pipe = ep.Pipeline("p", ep.CompGraph({"f": inside}, {"f": (("x", "k"), "y")}), {"k": 19})
+    cg = ep.CompGraph({"p": pipe, "h": around}, {"p": ("a", "b"), "h": (("b", "g"), "c")})
+    result = ep.optimize(ep.CompGraphRunner(cg, {"g": 0}), "c", [{"a": 0}], 20, ranges=ranges)
+    assert [*result.trials[0].setting] == (["p__k"] if ranges and "g" not in ranges else ["g", "p__k"])
+    assert len({trial.setting["p__k"] for trial in result.trials}) > 3
+    assert result.best_value > -50
+
+
 def test_the_first_trial_has_the_present_values(runner: ep.CompGraphRunner) -> None:
     assert settings_of(ep.optimize(runner, "score", [0], 1)) == [{"a": -3, "b": 3.0}]
 

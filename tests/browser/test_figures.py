@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -121,6 +122,51 @@ def photo() -> np.ndarray:
 def edges(photo: np.ndarray) -> str:
     """The page of a run of the edge graph."""
     return mimebundle(edge_runner().run(image=photo))["text/html"]
+
+
+# -- pictures of others -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        "<rect width='9' height='9' onclick='hit=1' onfocus='hit=1'/>",
+        "<image href='data:image/png;base64,AAAA' onerror='hit=1'/>",
+        "<image href='no/picture' onload='hit=1' onerror='hit=1'/>",
+        "<script>hit=1</script>",
+        "<foreignObject><img xmlns='http://www.w3.org/1999/xhtml' src='no' onerror='hit=1'/></foreignObject>",
+        "<img xmlns='http://www.w3.org/1999/xhtml' src='no' onerror='hit=1'/>",
+        "<animate attributeName='x' dur='1ms' begin='0s' onbegin='hit=1'/>",
+        "<a href='javascript:hit=1'><rect width='9' height='9'/></a>",
+    ],
+)
+def test_nothing_in_the_picture_of_an_untrusted_notebook_runs_when_a_trusted_one_explores(
+    sheet: Sheet, edges: str, inside: str
+) -> None:
+    svg = f"<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 9 9' onload='hit=1'>{inside}<title>t</title></svg>"
+    image = f'<img src="data:image/svg+xml,{quote(svg)}">'
+    # What JupyterLab lets through from a notebook that it does not trust.
+    sheet.put(f'<figure class="epypes-figure"><div>{image}</div></figure>', edges)
+    sheet.page.wait_for_selector("#token-edges")
+    shown = sheet.page.locator("figure.epypes-figure").first.locator("svg title")
+    assert shown.count() == 1, "it is inlined all the same"
+    for event in ("click", "focus", "load", "error", "begin"):
+        every = "(all, kind) => all.forEach(each => each.dispatchEvent(new Event(kind)))"
+        sheet.page.locator("figure.epypes-figure").first.locator("svg, svg *").evaluate_all(every, event)
+    assert sheet.page.evaluate("typeof hit") == "undefined"
+
+
+@pytest.mark.parametrize(("tag", "is_asked"), [("div", False), ("script type=application/json", True)])
+def test_a_kernel_is_asked_only_where_a_script_says_how(sheet: Sheet, edges: str, tag: str, is_asked: bool) -> None:
+    settings = f'<{tag} id="jupyter-config-data">{{"baseUrl": "http://127.0.0.1:9/"}}</{tag.split()[0]}>'
+    asked: list[str] = []
+    sheet.page.on("websocket", lambda socket: asked.append(socket.url))
+    sheet.put(settings, edges.replace('class="epypes-sheet"', 'class="epypes-sheet" data-run="kernel/run"', 1))
+    sheet.page.hover("#token-edges")
+    sheet.page.wait_for_function(
+        "what => document.querySelector('.epypes-card small')?.textContent === what", arg=KEPT_NOTE
+    )
+    assert bool(asked) == is_asked
 
 
 # -- cards ------------------------------------------------------------------------------------------------------------

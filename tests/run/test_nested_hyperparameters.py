@@ -363,3 +363,45 @@ def test_a_reactive_pipeline_takes_them_too(geometry, counted, kind):
     counted.taken()
     assert runner.rerun(f__threshold=5)["b"] == 10
     assert counted.taken() == ["ransac", "measure"]
+
+
+def test_an_input_that_was_a_hyperparameter_in_the_pipeline_is_new():
+    cg = ep.CompGraph({"f": lambda x, k: (x, k)}, {"f": (("x", "k"), "y")})
+    pipe = ep.Pipeline("p", cg, {"k": 2})
+    runner = ep.CompGraphRunner(ep.CompGraph({"p": pipe}, {"p": ("a", "b")}))
+    assert runner.run(a=1)["b"] == (1, 2)
+    pipe.runner.freeze(x=10)
+    pipe.runner.unfreeze("k")
+    assert runner.rerun()["b"] == (10, 1)
+
+
+def test_a_trial_is_adopted_only_if_the_pipeline_has_not_changed_since(runner, geometry):
+    runner.run(a=1)
+    tried = runner.trial({"geometry__threshold": 7})
+    geometry["threshold"] = 3
+    assert not runner.adopt(tried)
+    assert runner.adopt(runner.trial({"geometry__threshold": 8})), "what had changed before it does not matter"
+    assert runner["geometry__threshold"] == 8
+    assert runner["d"] == -16
+
+
+def test_the_runner_of_a_pipeline_may_be_replaced(runner, geometry):
+    runner.run(a=1)
+    geometry.runner = ep.CompGraphRunner(geometry.network, {"threshold": 5, "offset": 0})
+    assert runner.rerun()["d"] == -10
+    assert runner.rerun(geometry__threshold=9)["d"] == -18
+    assert runner.last.nested["geometry"]["inliers"] == 18
+
+
+def test_an_array_that_is_filled_again_is_new_inside_where_nothing_is_guarded_around(counted):
+    buffer = np.zeros(2)
+
+    def camera(a):
+        buffer[:] = a
+        return buffer
+
+    pipe = ep.Pipeline("p", ep.CompGraph({"f": lambda x, k: x.sum() + k}, {"f": (("x", "k"), "y")}), {"k": 0})
+    cg = ep.CompGraph({"camera": camera, "p": pipe}, {"camera": ("a", "image"), "p": ("image", "b")})
+    runner = ep.CompGraphRunner(cg, {"a": 1}, guard=False)
+    assert runner.run()["b"] == 2
+    assert [runner.rerun(a=n)["b"] for n in range(2, RUNS)] == [2 * n for n in range(2, RUNS)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.server
 import json
 import threading
+import traceback
 from contextlib import contextmanager
 
 import numpy as np
@@ -145,6 +146,20 @@ def test_no_error_shows_the_access_key_of_a_link(server):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("spoilt", ["{}\x00", "{}\r\nX: 1", "\n{} {}", "{}é"])
+def test_no_error_shows_an_access_key_that_a_header_cant_hold(server, spoilt):
+    with pytest.raises(ServiceError, match="no access key") as refused:
+        ep.connect(server.url, access_key=spoilt.format(server.token, server.token))
+    assert server.token not in "".join(traceback.format_exception(refused.value))
+    with pytest.raises(ServiceError, match="no access key"):
+        ep.connect(f"{server.url}/?access_key=a%0Ab")
+
+
+def test_an_access_key_may_be_as_it_is_read_from_its_file(server):
+    with ep.connect(server.url, access_key=server.access_key_file.read_text()) as connection:
+        assert connection.set(canny_lo=61).revision == 1
+
+
 def test_values_are_set_all_or_none_and_only_with_the_revision_that_was_seen(connection, service):
     seen = connection.parameters()
     assert connection.set(seen.revision, canny_lo=60, canny_hi=180).revision == 1

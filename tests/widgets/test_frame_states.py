@@ -222,6 +222,20 @@ def test_a_panel_without_images_tunes_the_last_run(smoothing: Smoothing) -> None
     panel.close(_WAIT_S)
 
 
+def test_the_state_of_a_nested_pipeline_is_that_of_its_hyperparameters_in_the_graph(smoothing: Smoothing) -> None:
+    inner = ep.Pipeline("inner", smoothing.runner.cg, {"k": 0.5, "gain": 1.0})
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": inner}, {"f": ("image", "y")}))
+    panel = tune(runner, images=smoothing.frames, f__k=(0.0, 1.0), f__gain=(0.0, 4.0))
+    try:
+        panel._tuning.want_image(20)
+        assert shown(panel) == pytest.approx(smoothing.y(20))
+        for k in (0.25, 0.75, 0.5):
+            panel["f__k"] = k
+            assert shown(panel) == pytest.approx(smoothing.y(20, k))
+    finally:
+        panel.close(_WAIT_S)
+
+
 def test_the_state_of_a_nested_pipeline_is_that_of_its_frame(smoothing: Smoothing) -> None:
     inner = ep.Pipeline("inner", smoothing.runner.cg, {"k": 0.5, "gain": 1.0})
     runner = ep.CompGraphRunner(

@@ -319,6 +319,14 @@ def test_a_file_of_another_graph_leaves_out_tokens_that_are_not_there(panel: Pan
     assert (panel["threshold"], panel.pictures) == (90, {})
 
 
+@pytest.mark.parametrize("limits", ["[1, 1" + 400 * "0" + "]", '"12"', '["1", "2"]', "{1 = 1, 2 = 2}", "[nan, 2]"])
+def test_limits_that_are_no_two_numbers_are_refused_with_their_place(tmp_path: Path, limits: str) -> None:
+    file = save(tmp_path / "edges", {"k": 3})
+    file.write_text(f"{file.read_text()}\n[pictures.image]\nlimits = {limits}\n")
+    with pytest.raises(SettingsError, match=r"\[pictures.image\]: limits can't be"):
+        load_pictures(file)
+
+
 def test_a_file_without_pictures_has_no_section(tmp_path: Path) -> None:
     assert "pictures" not in save(tmp_path / "plain", {"k": 3}, pictures={"image": PictureSettings()}).read_text()
     assert load_pictures(tmp_path / "plain") == {}

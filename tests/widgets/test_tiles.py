@@ -369,6 +369,15 @@ def test_tiles_are_remembered_by_the_runner_and_by_saved_settings(
         panel.tiles = ["half_ot"]
 
 
+def test_a_file_that_names_a_tile_twice_shows_it_once(shown: Any, image: Any, tmp_path: Path) -> None:
+    panel, _ = shown(runner_of({"count": count}, image))
+    file = panel.save(tmp_path / "good")
+    text = file.read_text().split("[panel]")[0]
+    file.write_text(f'{text}\n[panel]\ntiles = ["count_out", 3, "gone", "count_out"]\n')
+    panel.load(file)
+    assert panel.tiles == ("count_out",)
+
+
 def test_a_tile_is_computed_again_when_it_is_pinned(shown: Any, image: Any) -> None:
     panel, screen = shown(runner_of({"count": count}, image))
     panel.tiles = ()

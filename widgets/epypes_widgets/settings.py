@@ -127,10 +127,12 @@ def load_pictures(path: str | Path) -> dict[str, PictureSettings]:
 
 
 def load_tiles(path: str | Path) -> tuple[str, ...] | None:
-    """Return the tokens whose numbers were shown when a file was saved; None if it does not say."""
+    """Return the tokens whose numbers were shown when a file was saved, each once; None if it does not say."""
     panel = _read(_with_suffix(path)).get(_PANEL)
     tiles = panel.get("tiles") if isinstance(panel, dict) else None
-    return tuple(filter(lambda token: isinstance(token, str), tiles)) if isinstance(tiles, list) else None
+    return (
+        tuple(dict.fromkeys(filter(lambda token: isinstance(token, str), tiles))) if isinstance(tiles, list) else None
+    )
 
 
 def names(folder: str | Path) -> tuple[str, ...]:

@@ -7,6 +7,9 @@
 // stands says nothing: VS Code runs it at the end of the output, and a notebook may run it again.
 (() => {
   const VERTEX = "[id^=function-],[id^=token-]";
+  // What pictures are drawn with.
+  const DRAWN = new Set(("svg style title desc defs g path rect ellipse circle line polyline polygon text tspan image " +
+    "use marker pattern clipPath linearGradient stop").split(" "));
   const OWN_KEYS = "data-lm-suppress-shortcuts";
   const LARGER = 3, GAP = 10;
   // What a graph may take of the window's height; its text can't be read at a smaller scale than READABLE.
@@ -34,11 +37,17 @@
     return made;
   }
 
-  // Pages that do not trust a notebook keep images only, so the picture comes as one.
+  // Pages that do not trust a notebook keep images only, so the picture comes as one. It may be of such a notebook that
+  // is open beside a trusted one: only what can't run or load anything is taken from it.
   function inlined(image) {
     const text = decodeURIComponent(image.getAttribute("src").replace(/^[^,]*,/, ""));
     const svg = new DOMParser().parseFromString(text, "image/svg+xml").documentElement;
     if (svg.tagName !== "svg") return null;
+    for (const each of [svg, ...svg.querySelectorAll("*")]) {
+      if (each.namespaceURI !== svg.namespaceURI || !DRAWN.has(each.localName)) each.remove();
+      for (const { name, value } of [...each.attributes])
+        if (/^on/i.test(name) || (/href$/i.test(name) && !/^(#|data:image\/)/i.test(value))) each.removeAttribute(name);
+    }
     const shown = document.importNode(svg, true);
     shown.style.cssText = image.style.cssText;
     image.replaceWith(shown);
@@ -344,7 +353,8 @@
   // where no server of Jupyter's is behind the page. The address is "kernel/run". The request is one to execute nothing
   // and to evaluate an expression, so its answer comes over this connection alone.
   function kernelOf(address) {
-    const settings = document.getElementById("jupyter-config-data");
+    // Outputs of notebooks that are not trusted may have any id, but no scripts.
+    const settings = document.querySelector("script#jupyter-config-data");
     if (!address || !settings) return null;
     const unique = () => `${Date.now().toString(36)}-${Math.random().toString(36).slice(2)}`;
     const [id, run] = address.split("/"), session = unique();

@@ -48,10 +48,16 @@ class Control:
     Raises
     ------
     ServiceError
-        This is no address.
+        This is no address, or no access key.
     """
 
     def __init__(self, url: str, access_key: str, timeout_s: float) -> None:
+        # As it is read from its file, it ends a line.
+        access_key = access_key.strip()
+        if re.search("[^!-~]", access_key):
+            # A header can't hold it; what refuses it there shows all of it.
+            text = f"What was given for {url} is no access key: it has characters that none has. {_HOW_TO_CHANGE}"
+            raise ServiceError(url, text)
         self.url, self.timeout_s, self._has_key = url, timeout_s, bool(access_key)
         headers = {"Authorization": f"Bearer {access_key}"} if access_key else {}
         try:

@@ -96,7 +96,8 @@ class FrameStates:
         tokens = [delay.token for delay in cg.delays.values()]
         tokens += [token for name in nested for token in cg.func_outputs(name)]
         self.targets = tuple(dict.fromkeys(tokens))
-        self._tokens = subgraph(cg, self.targets).source_tokens
+        needed = subgraph(cg, self.targets)
+        self._tokens, self._inside = needed.source_tokens, tuple(f"{name}__" for name in needed.functions)
         # The one that was used last stands last.
         self._known: dict[object, _Checkpoints] = {}
 
@@ -104,7 +105,9 @@ class FrameStates:
         """Return what is equal as long as the states with these hyperparameters are the same."""
         functions = self._runner.cg.functions.values()
         revisions = [getattr(one, REVISION)(()) for one in functions if hasattr(type(one), REVISION)]
-        return (*(_identity(values[token]) for token in self._tokens if token in values), *revisions)
+        inside = [token for token in values if token not in self._tokens and token.startswith(self._inside)]
+        tokens = (*(token for token in self._tokens if token in values), *sorted(inside))
+        return (*(_identity(values[token]) for token in tokens), *revisions)
 
     def trial(
         self,

@@ -7,6 +7,7 @@ browser has 8 of 16 bits only; all others in the browser, where they take no tim
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from types import MappingProxyType
@@ -87,8 +88,9 @@ class PictureSettings:
 
 def _checked_limits(given: Any) -> Range:
     try:
-        low, high = (float(end) for end in given)
-    except (TypeError, ValueError):
+        # An integer of a file may be larger than any float; texts and the keys of tables are no numbers.
+        low, high = (float(end) if isinstance(end, numbers.Real) else math.nan for end in given)
+    except (TypeError, ValueError, OverflowError):
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(f"limits can't be {given!r:.60}: they are two numbers, black and white, the lower one first.")
