@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import io
+import json
 import subprocess
 import sys
 import tokenize
@@ -91,6 +92,12 @@ def lines_of_code(path):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             found.difference_update(range(node.lineno, node.end_lineno + 1))
     return found
+
+
+def test_tutorials_hold_no_widgets_whose_script_would_be_an_older_one():
+    notebooks = [*(ROOT / "notebooks").glob("*.ipynb")]
+    assert notebooks
+    assert [path.name for path in notebooks if "widgets" in json.loads(path.read_text())["metadata"]] == []
 
 
 def test_errors_are_drawn_as_a_tree_that_is_true():

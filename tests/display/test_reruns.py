@@ -20,7 +20,7 @@ import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 
 PACKAGE = str(Path(ep.__file__).parent)
-MOST_CALLS = 950
+MOST_CALLS = 1_000
 
 
 def calls_of(function: Callable[[], object]) -> Counter[str]:

@@ -350,7 +350,7 @@ def _annotations_in(parts: Mapping[str, Any]) -> dict[str, Any]:
 
 def _named_by(word: str, value: Any) -> Any:
     """Return an attribute that says how Python calls a function or class of the user; of a method, also those in it."""
-    if not isinstance(value, types.FunctionType | type) or is_installed(value.__module__):
+    if not isinstance(value, types.FunctionType | type) or is_installed(str(value.__module__)):
         return None
     if word != "__qualname__" or isinstance(value, type):
         return getattr(value, word)

@@ -26,6 +26,7 @@ from epypes.display.previews.preview import scene_in, sketch
 from epypes.graph import colour_order
 from epypes.graph.identity import innermost
 from epypes.run import CompGraphRunner, Run
+from epypes.run.guard import is_array
 from epypes.run.program import Program
 
 if TYPE_CHECKING:
@@ -224,7 +225,7 @@ def _is_scalar(value: Any) -> bool:
     kind = type(value)
     is_text = kind is str and len(value) <= _SCALAR_CHARACTERS
     # Most values are arrays, which are known at a glance.
-    return kind in (bool, int, float) or is_text or (kind.__name__ != "ndarray" and is_of(value, "numpy", "generic"))
+    return kind in (bool, int, float) or is_text or (not is_array(value) and is_of(value, "numpy", "generic"))
 
 
 def _names_in(code: object) -> frozenset[str]:
