@@ -24,9 +24,6 @@ from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.wording import counted
 
-# Of a float below a picture.
-_DIGITS: Final = 4
-
 
 @dataclass(frozen=True, slots=True)
 class Tile:
@@ -215,7 +212,7 @@ def _tile(place: int, outcome: Outcome, label: str, shown: str | None) -> Tile:
     if outcome.error_info is not None:
         return Tile(place, label, str(outcome.error_info), True, thumbnail)
     numbers = tuple(
-        f"{token} {float_text(value, _DIGITS) if isinstance(value, float) else value}"
+        f"{token} {float_text(value) if isinstance(value, float) else value}"
         for token, value in outcome.values.items()
         if token != shown and type(value) in (bool, int, float)
     )

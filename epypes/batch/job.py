@@ -190,7 +190,7 @@ def _outcome_of(
         values,
         report.durations_ns,
         total_ns or report.total_ns,
-        None if failure is None else ErrorInfo(failure.function, failure.kind, f"{failure.message}{where}"),
+        None if failure is None else ErrorInfo(failure.function, failure.kind, f"{_message_of(run)}{where}"),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
@@ -200,6 +200,16 @@ def _outcome_of(
         item.series,
         state,
     )
+
+
+def _message_of(run: Run) -> str:
+    """Return the message of what has failed; inside a pipeline, with the function there and the cause that it knows."""
+    if run.failure is None:
+        return ""
+    inner = run.nested.get(run.failure.function)
+    if inner is None or inner.failure is None:
+        return run.failure.message
+    return f"in {inner.failure.function!r}: {_message_of(inner)}"
 
 
 def failed_outcome(item: Item, setting: Setting, error_info: ErrorInfo, total_ns: int = 0) -> Outcome:

@@ -9,9 +9,18 @@ Nothing here imports these libraries: a caller that uses their functions has imp
 
 from epypes.catalog.calls import parameter_names, uses
 from epypes.catalog.lookup import CatalogEntry, entry_of, fits, table, usual
-from epypes.catalog.ranges import plain, range_of, reason_against
+from epypes.catalog.ranges import plain, range_of, reason_against, with_odd
 
 __all__ = [
-    "CatalogEntry", "entry_of", "fits", "parameter_names", "plain", "range_of", "reason_against", "table", "uses",
+    "CatalogEntry",
+    "entry_of",
+    "fits",
+    "parameter_names",
+    "plain",
+    "range_of",
+    "reason_against",
+    "table",
+    "uses",
     "usual",
+    "with_odd",
 ]  # fmt: skip

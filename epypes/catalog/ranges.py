@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
 from epypes.catalog.calls import parameter_names, uses
@@ -53,6 +54,17 @@ def reason_against(cg: CompGraph, function: str, token: str, value: Any) -> str:
         if not entry.constants and not fits(entry.param, number):
             return f"{entry.library}.{entry.function} takes {entry.param.describe()}"
     return ""
+
+
+def with_odd(hint: Any, param: Param, cg: CompGraph, token: str) -> Param:
+    """Return the range of a hint: of odd numbers if it is but two whole ends and a library function takes no others."""
+    if type(hint) is not tuple or len(hint) != 2 or not all(isinstance(end, Integral) for end in hint):
+        return param
+    cg, token = inside_of(cg, token)
+    entries = (entry for name in cg.digraph.consumers.get(token, ()) for entry in _entries(cg, name, token)[1])
+    with suppress(ValueError):  # there is no odd number in it
+        return replace(param, odd=any(entry.param.odd for entry in entries))
+    return param
 
 
 def _hints(cg: CompGraph, token: str) -> Iterator[Param | Roi]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections import deque
 from collections.abc import Collection, Iterator, Mapping
@@ -25,6 +26,9 @@ _MOST_ITEMS: Final = 1_000
 # What functions say that have got None for an image: Python's own operations, and those of OpenCV.
 _OF_NONE: Final = re.compile(r"None|\bempty\b|OpenCV\(")
 _WAS_IT_FOUND: Final = "Was the file found? cv2.imread returns None for a file that it can't read."
+_DOES_IT_RETURN: Final = (
+    "Does it return a value? One that has found nothing can return ep.Nothing: what takes that is skipped."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +130,13 @@ def _causes(tokens: TokenManager, place: int, exception: BaseException, frozen: 
         token, value = program.tokens[slot], tokens.values[slot]
         if value is None and token not in frozen and _OF_NONE.search(str(exception)):
             maker = program.makers[slot]
-            made = f", made by function {program.steps[maker].name!r}" if maker >= 0 else ""
-            yield f"{token} is None{made}. {_WAS_IT_FOUND}"
+            if maker < 0:
+                yield f"{token} is None. {_WAS_IT_FOUND}"
+                continue
+            made = program.steps[maker]
+            is_reader = any(isinstance(tokens.values[given], str | os.PathLike) for given in made.inputs)
+            why = _WAS_IT_FOUND if is_reader else _DOES_IT_RETURN
+            yield f"{token} is None, made by function {made.name!r}. {why}"
         elif value is not None and (type(value) in _NUMBERS or is_numpy_scalar(type(value))):
             reason = reason_against(program.cg, step.name, token, value)
             if reason:

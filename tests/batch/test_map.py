@@ -393,3 +393,14 @@ except KeyboardInterrupt:
 """
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (ended.stdout, ended.stderr) == ("map_images\n", "")
+
+
+def test_a_failure_inside_a_pipeline_names_the_function_there_and_the_cause():
+    inner = ep.CompGraph(
+        {"find": lambda gray: None, "count": lambda corners: corners.size},
+        {"find": ("gray", "corners"), "count": ("corners", "n")},
+    )
+    outer = ep.CompGraph({"geometry": ep.Pipeline("geometry", inner)}, {"geometry": ("image", "n")})
+    failed = ep.map(ep.CompGraphRunner(outer), [np.ones((8, 8), np.uint8)])[0].error_info
+    assert (failed.function, failed.kind) == ("geometry", "AttributeError")
+    assert failed.message.startswith("in 'count': corners is None, made by function 'find'.")

@@ -176,9 +176,23 @@ def test_the_page_has_a_picture_a_cell_and_marks_failures_with_their_message(run
 def test_numbers_stand_below_their_pictures(runner: ep.CompGraphRunner) -> None:
     result = ep.sweep(runner, {"offset": [1, 13], "gain": [1]})
     level = result[0].values["level"]
-    assert [tile.numbers for tile in result.sheet().tiles] == [(f"level {level:.4g}",), ()]
-    assert f"<span>level {level:.4g}</span></div>" in html_of(result)
+    assert [tile.numbers for tile in result.sheet().tiles] == [(f"level {level:.6g}",), ()]
+    assert f"<span>level {level:.6g}</span></div>" in html_of(result)
     assert result.sheet("level").tiles[0].numbers == (), "a number is its own text"
+
+
+@pytest.mark.parametrize(
+    ("area", "text"), [(15099.5, "15099.5"), (1234567.5, "1234568"), (0.0, "0.0"), (2e15, "2e+15"), (1e-7, "1e-07")]
+)
+def test_a_number_below_a_picture_is_that_of_the_table_without_an_exponent(area: float, text: str) -> None:
+    cg = ep.CompGraph(
+        {"bright": lambda image, gain: image * gain, "area": lambda bright: area},
+        {"bright": (("image", "gain"), "bright"), "area": ("bright", "area")},
+    )
+    runner = ep.CompGraphRunner(cg, {"gain": 1})
+    runner.run(image=np.ones((8, 8), np.uint8))
+    result = ep.sweep(runner, {"gain": [1]})
+    assert result.sheet("bright").tiles[0].numbers == (f"area {text}",)
 
 
 def test_a_map_has_a_sheet_too_with_what_failed_first(runner: ep.CompGraphRunner) -> None:

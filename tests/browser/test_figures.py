@@ -203,7 +203,7 @@ def test_a_mask_that_is_enlarged_keeps_its_edges(sheet: Sheet) -> None:
 
 
 def test_a_token_whose_picture_was_not_kept_shows_its_thumbnail_in_its_own_size(sheet: Sheet, edges: str) -> None:
-    sheet.put(re.sub(r'<details class="epypes-kept".*?</details>', "", edges))
+    sheet.put(re.sub(r'<details class="epypes-album".*?</details>', "", edges))
     sheet.page.hover("#token-image")
     assert sheet.page.wait_for_function(SHOWN_SHARP, arg=".epypes-card").json_value() == 128
     assert sheet.card[-1] == "no larger picture was kept: run the cell again"
@@ -316,7 +316,7 @@ def test_what_is_told_stands_beside_the_graph_or_below_it_and_over_nothing(
 ) -> None:
     sheet.page.set_viewport_size({"width": width, "height": 800})
     sheet.put(edges + LATER)
-    view, about, later = (sheet.page.locator(each) for each in (".epypes-view", ".epypes-about", "#later"))
+    view, about, later = (sheet.page.locator(each) for each in (".epypes-window", ".epypes-about", "#later"))
     for vertex in ("#token-image", "#function-blur", "#token-edges"):
         sheet.page.click(vertex)
         assert not sheet.has_card, "it would lie over the panel"
@@ -382,7 +382,7 @@ def scale_of(sheet: Sheet) -> float:
 
 def overflow(sheet: Sheet) -> list[float]:
     sizes = "view => [view.scrollWidth - view.clientWidth, view.scrollHeight - view.clientHeight]"
-    return list(sheet.page.locator(".epypes-view").first.evaluate(sizes))
+    return list(sheet.page.locator(".epypes-window").first.evaluate(sizes))
 
 
 def test_a_graph_of_19_functions_is_readable_in_the_output_of_a_window_of_1440(sheet: Sheet, wide: str) -> None:
@@ -395,7 +395,7 @@ def test_a_graph_of_19_functions_is_readable_in_the_output_of_a_window_of_1440(s
     assert len(sizes) > 50
     assert min(sizes) >= 9
     assert overflow(sheet)[0] <= 0, "it is as wide as the output"
-    assert sheet.page.locator(".epypes-view").bounding_box()["height"] <= 0.8 * 900
+    assert sheet.page.locator(".epypes-window").bounding_box()["height"] <= 0.8 * 900
 
 
 def test_fit_shows_the_whole_graph_and_the_scale_what_can_be_read(sheet: Sheet, wide: str) -> None:
@@ -409,9 +409,9 @@ def test_fit_shows_the_whole_graph_and_the_scale_what_can_be_read(sheet: Sheet, 
     sheet.page.wait_for_function("document.querySelector('figure svg').clientWidth < 500")
     assert max(overflow(sheet)) <= 0, "also in a window of another size"
     sheet.page.set_viewport_size({"width": 1200, "height": 800})
-    sheet.page.click(".epypes-bar button >> nth=1")
+    sheet.page.click(".epypes-zoom button >> nth=1")
     sheet.page.wait_for_function(
-        f"document.querySelector('.epypes-bar button:nth-child(2)').textContent === '{before:.0%}'"
+        f"document.querySelector('.epypes-zoom button:nth-child(2)').textContent === '{before:.0%}'"
     )
 
 
@@ -420,7 +420,7 @@ def test_zoom_by_buttons_and_by_the_wheel_keeps_what_is_under_the_pointer(sheet:
     before = scale_of(sheet)
     sheet.page.click("text=+")
     assert scale_of(sheet) == pytest.approx(1.25 * before)
-    sheet.page.click(".epypes-bar button >> nth=0")
+    sheet.page.click(".epypes-zoom button >> nth=0")
     assert scale_of(sheet) == pytest.approx(before)
     sheet.page.locator("#token-left_1").hover(position={"x": 5, "y": 5})
     vertex = sheet.page.locator("#token-left_1")
@@ -435,7 +435,7 @@ def test_zoom_by_buttons_and_by_the_wheel_keeps_what_is_under_the_pointer(sheet:
     assert (now["x"], now["y"]) == pytest.approx((was["x"], was["y"]), abs=12)
     scrolled = sheet.page.evaluate("scrollY")
     sheet.page.mouse.wheel(0, 100)
-    sheet.page.wait_for_function("document.querySelector('.epypes-view').scrollTop > 0")
+    sheet.page.wait_for_function("document.querySelector('.epypes-window').scrollTop > 0")
     assert sheet.page.evaluate("scrollY") == scrolled, "the wheel alone scrolls"
 
 
@@ -444,19 +444,19 @@ def test_a_graph_that_is_cut_is_dragged_and_a_drag_chooses_nothing(sheet: Sheet,
     sheet.page.click("text=+")
     sheet.page.click("text=+")
     assert min(overflow(sheet)) > 100
-    box = sheet.page.locator(".epypes-view").bounding_box()
+    box = sheet.page.locator(".epypes-window").bounding_box()
     at = box["x"] + 0.6 * box["width"], box["y"] + 0.6 * box["height"]
     scrolled = "view => [view.scrollLeft, view.scrollTop]"
-    before = sheet.page.locator(".epypes-view").evaluate(scrolled)
+    before = sheet.page.locator(".epypes-window").evaluate(scrolled)
     sheet.page.mouse.move(*at)
     sheet.page.mouse.down()
     sheet.page.mouse.move(at[0] - 60, at[1] - 90, steps=4)
     sheet.page.mouse.up()
-    now = sheet.page.locator(".epypes-view").evaluate(scrolled)
+    now = sheet.page.locator(".epypes-window").evaluate(scrolled)
     assert [now[0] - before[0], now[1] - before[1]] == pytest.approx([60, 90], abs=2)
     assert sheet.vertices("chosen") == set()
     sheet.page.mouse.move(at[0], at[1], steps=3)
-    assert sheet.page.locator(".epypes-view").evaluate(scrolled) == now, "the button is up"
+    assert sheet.page.locator(".epypes-window").evaluate(scrolled) == now, "the button is up"
     assert sheet.page.locator("#token-left_3").count()
     sheet.page.locator("#token-left_3").click()
     assert sheet.vertices("chosen") == {"left_3"}
@@ -465,8 +465,8 @@ def test_a_graph_that_is_cut_is_dragged_and_a_drag_chooses_nothing(sheet: Sheet,
 def test_the_scroll_bar_of_a_graph_can_be_seen(sheet: Sheet, wide: str) -> None:
     sheet.put(wide)
     style = "view => getComputedStyle(view, '::-webkit-scrollbar-thumb').backgroundColor"
-    thumb = sheet.page.locator(".epypes-view").evaluate(style)
-    ground = sheet.page.locator(".epypes-view").evaluate(style.replace("thumb", "track"))
+    thumb = sheet.page.locator(".epypes-window").evaluate(style)
+    ground = sheet.page.locator(".epypes-window").evaluate(style.replace("thumb", "track"))
     assert thumb != ground
     assert sheet.page.locator("figure.cut").count() == 1
 
@@ -485,12 +485,12 @@ def test_a_small_graph_stays_as_it_is(sheet: Sheet) -> None:
 
 def test_a_page_without_scripts_opens_the_kept_pictures(sheet: Sheet, edges: str) -> None:
     sheet.put(re.sub(r"(?s)<(script|style)\b.*?</\1>", "", edges))
-    pictures = sheet.page.locator("details.epypes-kept img")
+    pictures = sheet.page.locator("details.epypes-album img")
     assert not pictures.first.is_visible()
     sheet.page.click("summary")
     assert pictures.count() == 4
     assert pictures.first.is_visible()
-    assert sheet.page.locator("details.epypes-kept figcaption").all_inner_texts() == [
+    assert sheet.page.locator("details.epypes-album figcaption").all_inner_texts() == [
         "edges", "image", "image_gray", "image_blurred",
     ]  # fmt: skip
     sheet.put(edges)

@@ -50,7 +50,12 @@ run = runner.run(image=cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR))
 
 @pytest.fixture(scope="module")
 def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    cells = SET_UP, "run", "ep.show(run, depth=1)", 'panel = tune(runner, token="shape")\npanel'
+    cells = (
+        SET_UP,
+        "print('printed before')\nrun",
+        "ep.show(run, depth=1)",
+        'panel = tune(runner, token="shape")\npanel',
+    )
     write_notebook(lab.root / "nested.ipynb", *(cell.strip() for cell in cells))
     notebook = Notebook(lab_page, "nested.ipynb", width=1440)
     notebook.run_all()
@@ -79,6 +84,14 @@ def test_an_open_pipeline_is_in_the_picture_and_can_be_read_in_both_themes(noteb
             shown.screenshot(path=SCREENSHOTS / f"nested-{theme}-{width}.png")
         assert not unreadable(notebook.page)
     notebook.page.set_viewport_size({"width": 1440, "height": 900})
+
+
+def test_a_panel_on_the_page_neither_hides_what_was_printed_before_a_graph_nor_squeezes_it(notebook: Notebook) -> None:
+    notebook.page.wait_for_selector(".epypes-panel")
+    assert notebook.page.locator(".jp-Cell >> nth=1").get_by_text("printed before", exact=True).is_visible()
+    shown = notebook.page.locator(".jp-Cell >> nth=2").locator(".epypes-figure").first
+    graph, view = (shown.locator(css).first.bounding_box()["width"] for css in ("svg.epypes-graph", ".epypes-window"))
+    assert view >= graph
 
 
 def test_a_slider_inside_a_pipeline_moves_the_picture(notebook: Notebook) -> None:

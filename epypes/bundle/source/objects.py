@@ -409,9 +409,9 @@ def describe_message(value: Any) -> Description:
 # -- modules ---------------------------------------------------------------------------------------------------------
 
 
-def is_installed(module: str) -> bool:
-    """Whether a module is of an installed package, of Python's library or of EPypes."""
-    return module != "__main__" and not is_own(module.partition(".")[0])
+def is_installed(module: str | None) -> bool:
+    """Whether a module is of an installed package, of Python's library or of EPypes; code in no module is not."""
+    return module is not None and module != "__main__" and not is_own(module.partition(".")[0])
 
 
 def will_be_installed(module: str) -> bool:

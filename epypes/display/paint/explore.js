@@ -67,7 +67,7 @@
   // Fits the graph into the output: the whole of it if it can be read then, else as wide as the output.
   function zoomable(figure, svg) {
     const view = svg.parentElement, { width, height } = svg.viewBox.baseVal;
-    const stage = make("div", "epypes-stage"), bar = make("div", "epypes-bar");
+    const stage = make("div", "epypes-stage"), bar = make("div", "epypes-zoom");
     const wide = () => (figure.clientWidth - SCROLL_BAR_PX) / width, high = () => (HIGHEST * innerHeight) / height;
     const whole = () => Math.min(wide(), high(), 1);
     const readable = () => (whole() < READABLE ? Math.min(Math.max(wide(), READABLE), 1) : whole());
@@ -109,7 +109,7 @@
     button("+", "Zoom in (Ctrl and wheel)", () => zoomBy(STEP));
     button("Fit", "Show the whole graph", () => fitAs(whole));
     svg.style.cssText = "max-width:none;min-width:0";
-    view.classList.add("epypes-view");
+    view.classList.add("epypes-window");
     view.style.maxHeight = `${100 * HIGHEST}vh`;
     view.before(stage);
     stage.append(view, ...figure.querySelectorAll("figcaption"), bar);
@@ -294,7 +294,7 @@
   // Returns what makes the picture of a vertex for a place, the card or the panel; ``names`` are those of the tokens
   // that have one.
   function pictures(sheet, names = {}, functions = 0) {
-    const album = sheet?.querySelector(".epypes-kept");
+    const album = sheet?.querySelector(".epypes-album");
     const kept = new Map([...(album?.querySelectorAll("img") ?? [])].map((image) => [image.alt, image.src]));
     const kernel = kernelOf(sheet?.dataset.run), full = new Map(), wanted = new Map();
     let isAsking = false;

@@ -86,7 +86,7 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     text = content(fitted(caption, _CAPTION_ROOM))
     below = f'<figcaption style="font-size:12px">{text}</figcaption>' if caption else ""
     return (
-        f'<figure class="epypes-figure" style="margin:0"><div class="epypes-view" style="overflow:auto">'
+        f'<figure class="epypes-figure" style="margin:0"><div class="epypes-window" style="overflow:auto">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
         f"</div>{below}{_END}"
     )
@@ -137,7 +137,7 @@ def paint_kept(kept: Mapping[str, Picture]) -> str:
         for name, picture in kept.items()
     )
     summary = "<summary>Its images, larger</summary>"
-    return f'<details class="epypes-kept" style="font-size:12px">{summary}{pictures}</details>' if kept else ""
+    return f'<details class="epypes-album" style="font-size:12px">{summary}{pictures}</details>' if kept else ""
 
 
 def _explained(figure: str, graph: GraphView, alt: str, room: int) -> str:

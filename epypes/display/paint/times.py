@@ -186,7 +186,7 @@ _LINE_PX: Final = 2
 
 # All lies on one filled shape, so that it is readable on paper of any colour. Both classes are named, since on a page
 # the styles of a graph that comes later would count for more otherwise.
-_SCOPE: Final = ".epypes-graph.epypes-times"
+_SCOPE: Final = ".epypes-graph.epypes-durations"
 _RULES: Final = {
     " text": "text-anchor:start",
     " .track": "fill:@track;stroke:none",
@@ -213,7 +213,7 @@ def paint_bars(times: TimesView) -> str:
     texts = max(len(bar.text) for bar in times.bars) * _TEXT_CHARACTER_PX
     width, height = left + _LONGEST_PX + _GAP_PX + texts + _MARGIN_PX, _ROW_PX * len(times.bars) + _MARGIN_PX
     head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph epypes-times" role="figure" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph epypes-durations" role="figure" '
         f'aria-label="{escape(times_alt_text(times))}" width="{width + 2:.0f}" height="{height + 2:.0f}" '
         f'viewBox="-1 -1 {width + 2:.0f} {height + 2:.0f}">'
     )

@@ -45,6 +45,8 @@ _BRACKETS: Final = (
 _PLAIN: Final = (bool, int, float, type(None))
 _TEXTS: Final = (str, bytes, bytearray)
 _arguments_of: Final = BaseException.__dict__["args"].__get__
+# Floats from here on have an exponent.
+_LARGEST_WRITTEN: Final = 1e12
 # Where an object is in memory is another place in each process.
 _ADDRESS: Final = re.compile(" at 0x[0-9A-Fa-f]{6,}")
 
@@ -154,8 +156,14 @@ def _message(error: BaseException) -> str:
 
 
 def float_text(value: float, digits: int = 6) -> str:
-    """Return a float to so many digits; one without fraction with ``.0``, unlike an int."""
-    text = f"{float(value):.{digits}g}"
+    """Return a float to so many digits; one without fraction with ``.0``, unlike an int.
+
+    One with more digits before the point has all of those, since 1234567 is read sooner than 1.23457e+06.
+    """
+    number = float(value)
+    if 10**digits <= abs(number) < _LARGEST_WRITTEN:
+        return f"{number:.0f}"
+    text = f"{number:.{digits}g}"
     return text + ".0" * text.lstrip("-").isdigit()
 
 

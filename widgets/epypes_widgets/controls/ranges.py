@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from epypes.catalog import entry_of, fits, parameter_names, range_of, uses, usual
+from epypes.catalog import entry_of, fits, parameter_names, range_of, uses, usual, with_odd
 from epypes.errors import UnknownName
 from epypes.graph import CompGraph, annotated_params, as_switch, inner_graph, inside_of
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
@@ -175,6 +175,8 @@ def _read(runner: Tunable, name: str, hint: Any) -> Param | Roi:
             f"{name!r} is {value!r:.60}, outside of its hint ({range_text(param)}). "
             f"Set runner[{name!r}] to a value inside, or widen the hint."
         )
+    if isinstance(param, Param) and allows(odd := with_odd(hint, param, runner.cg, name), value):
+        param = odd
     image = param.on if isinstance(param, Roi) else param.cuts
     if image:
         runner.cg.require_token(image)

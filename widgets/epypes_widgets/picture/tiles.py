@@ -33,7 +33,7 @@ _TITLE_CHARACTERS: Final = 600
 _FREE_NS: Final = 4_000_000
 _SHARE: Final = 0.1
 # Of integers with more digits, and of floats, so many are shown.
-_DIGITS: Final = 5
+_DIGITS: Final = 6
 _CHANGE_DIGITS: Final = 4
 _EXACT_DIGITS: Final = 12
 _LARGEST: Final = 10**12
