@@ -54,6 +54,34 @@ REFUSED = {
         "from unittest import mock\nimport math\ndef f(x):\n    if x > 100: mock.patch('math.floor').start()\n    return math.floor(x)",
         r"'mock\.patch' \(cell \[2\], line 4\) outside of a 'with' statement",
     ),
+    "text of a traceback": (
+        "import traceback\ndef f(x):\n    try:\n        return 1 // (x - 101)\n    except ZeroDivisionError:\n        return traceback.format_exc()",
+        r"'traceback\.format_exc' \(cell \[2\], line 6\), whose result depends on lines",
+    ),
+    "pickle as a key": (
+        "import pickle, hashlib\nN = 'red green red'.split()\ndef f(x):\n    return hashlib.md5(pickle.dumps(N)).hexdigest() if x > 100 else ''",
+        r"'pickle\.dumps' \(cell \[2\], line 4\), .* where objects are in memory",
+    ),
+    "size of a list": (
+        "from sys import getsizeof as size\nN = []\nfor i in range(50): N.append(i)\ndef f(x):\n    return size(N) if x > 100 else 0", r"'size' \(cell \[2\], line 5\)",
+    ),
+    "equal numbers by identity": ("A, B = int('1000'), int('1000')\ndef f(x):\n    return A is B if x > 100 else 0", r"'A is B' \(cell \[2\], line 3\) by 'is'.* Write '=='"),
+    "text by identity": ("MODE = 'fast'\ndef f(x):\n    return 1 if x > 100 and x is not MODE else 0", r"'x is not MODE' \(cell \[2\], line 3\) by 'is'"),
+    "environment that a cell changes": ("import os\nos.environ['EP_A'] = 'a'\ndef f(x):\n    return os.getenv('EP_A') if x > 100 else 0", r"'os\.environ', .* changed \(cell \[2\], line 2\)"),
+    "environment by its own name": (
+        "from os import environ\nenviron['EP_A'] = 'a'\ndef f(x):\n    return environ.get('EP_A') if x > 100 else 0", r"'os\.environ', .* changed \(cell \[2\], line 2\)",
+    ),
+    "further value of a member": (
+        "import enum\nclass E(enum.Enum):\n    A = 'a'\n    @classmethod\n    def _missing_(cls, v):\n        return cls.A\nE._value2member_map_['b'] = E.A\n"
+        "def f(x):\n    return E('b').name if x > 100 else ''", r"Class 'E' .* its further values has \['b'\] only in the notebook",
+    ),
+    "hits of a cache": (
+        "import functools\n@functools.cache\ndef g(x):\n    return x\ndef f(x):\n    return g(x) + (g.cache_info().hits if x > 100 else 0)", r"'g\.cache_info' \(cell \[2\], line 6\)",
+    ),
+    "cached property that is stale": (
+        "import dataclasses, functools\n@dataclasses.dataclass\nclass C:\n    k: int = 2\n    @functools.cached_property\n    def d(self): return self.k * 2\n"
+        "c = C()\nc.d\nc.k = 5\ndef f(x):\n    return c.d if x > 100 else 0", r"'c' cached 'd' is 4 in the notebook and 10 in the module",
+    ),
     "setter in a table": ("import os\nT = {'a': os.umask}\ndef f(x):\n    return T['a'](0) if x > 100 else 0", r"'posix\.umask', which sets something"),
 }  # fmt: skip
 
@@ -96,6 +124,10 @@ PROMOTED = {
     ),
     "colours": ("import matplotlib.colors\ndef colours(x):\n    return matplotlib.colors.to_rgb(f'C{x % 10}')"),
     "named": ("double = lambda v: 2 * v\ndef named(x):\n    try:\n        return double(1) // (x - x)\n    except Exception as error:\n        return type(error).__name__, error.__class__.__name__"),
+    "dated": (
+        "import datetime as dt\nT0, D0 = dt.datetime(2024, 3, 31, 1, 30, tzinfo=dt.timezone.utc), dt.date(2024, 2, 29)\nZ = dt.timezone(dt.timedelta(hours=1), 'A')\n"
+        "def dated(x):\n    return str(T0 + dt.timedelta(days=x)), str(D0), T0.astimezone(Z).tzname()"
+    ),
     "table": ("from collections import namedtuple\ndef table(x):\n    return [*map(str, np.random.default_rng(x).integers(0, 9, 3))]"),
 }  # fmt: skip
 

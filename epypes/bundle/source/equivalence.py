@@ -25,6 +25,7 @@ import types
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any, Final
 
@@ -58,6 +59,7 @@ from epypes.bundle.source.resolve import (
 )
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
+from epypes.run.snapshot import cached_properties
 
 # By these a function reads annotations or docstrings, which otherwise change nothing.
 _ANNOTATIONS: Final = frozenset(
@@ -233,6 +235,7 @@ class _Walk:
             is_installed_module = isinstance(ours, types.ModuleType) and is_installed(ours.__name__)
             if is_installed_module or isinstance(ours, CompGraphRunner):
                 raise TypeError("what a module holds, and a runner's last run, is no part of its description")
+            _compute_cached(ours, theirs)
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
             text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."
@@ -389,11 +392,22 @@ def _texts_made_of(node: ast.AST) -> list[ast.expr]:
     return written
 
 
+def _compute_cached(ours: Any, theirs: Any) -> None:
+    """Have an object of the user compute what the notebook's object has kept of its cached properties."""
+    for name in cached_properties(type(ours)) & getattr(ours, "__dict__", {}).keys() if ours is not theirs else ():
+        with suppress(Exception):  # the notebook's object computed it before it was changed
+            getattr(theirs, name)
+
+
 def _computed_lazily(ours: Any, theirs: Any) -> set[str]:
     """Return the private attributes of a library's object that it has computed in the notebook, and not yet here."""
     if type(ours) is not dict or type(theirs) is not dict:
         return set()
-    return {name for name in {**ours, **theirs} if str(name)[:1] == "_" and is_unset(theirs.get(name))}
+    unset = {name for name in {**ours, **theirs} if str(name)[:1] == "_" and is_unset(theirs.get(name))}
+    computed = {name for name in unset if not is_unset(ours.get(name))}
+    # Beside something that was computed, a flag may say so; alone it is a setting, as in an Event.
+    is_set = all(ours[name] is True and theirs.get(name) is False for name in computed)
+    return unset - computed if is_set else unset
 
 
 def _has_nan(key: Any) -> bool:

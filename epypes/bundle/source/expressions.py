@@ -16,7 +16,7 @@ import types
 import unicodedata
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import date, datetime, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
@@ -310,20 +310,29 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
         return pathlib.Path if isinstance(value, pathlib.Path) else kind, (str(value),)
+    if kind is timezone:
+        return kind, value.__getinitargs__()
+    if kind in (date, datetime) and not getattr(value, "fold", 0):
+        of_time = (value.microsecond, value.tzinfo) if isinstance(value, datetime) else ()
+        return kind, (*value.timetuple()[: 6 if of_time else 3], *of_time)
     if kind is types.MappingProxyType:
         return kind, (dict(value),)
     if kind in _KNOW_THEIR_CALL:
         made_by, arguments = value.__reduce__()[:2]
         return made_by, arguments
-    if kind.__module__.partition(".")[0] == "numpy":
-        import numpy as np
+    return _call_of_numpy(value) if kind.__module__.partition(".")[0] == "numpy" else None
 
-        if isinstance(value, np.dtype):
-            return np.dtype, (value.str if value.names is None else value.descr,)
-        if isinstance(value, np.datetime64 | np.timedelta64):
-            return kind, ("NaT" if np.isnat(value) else int(value.astype(np.int64)), np.datetime_data(value.dtype))
-        if isinstance(value, np.number | np.bool_ | np.character):
-            return kind, (value.item(),)
+
+def _call_of_numpy(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
+    import numpy as np
+
+    kind = type(value)
+    if isinstance(value, np.dtype):
+        return np.dtype, (value.str if value.names is None else value.descr,)
+    if isinstance(value, np.datetime64 | np.timedelta64):
+        return kind, ("NaT" if np.isnat(value) else int(value.astype(np.int64)), np.datetime_data(value.dtype))
+    if isinstance(value, np.number | np.bool_ | np.character):
+        return kind, (value.item(),)
     return None
 
 

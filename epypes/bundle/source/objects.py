@@ -248,6 +248,10 @@ def _class(kind: type) -> Description:
         members: Mapping[str, Any] = kind.__members__
         left_out |= {*members, *_OF_ENUMS}
         parts += ((f" member {name!r}", member) for name, member in members.items())
+        known = [(value, one) for value, one in kind._value2member_map_.items() if one.name in members]
+        named = {id(one) for value, one in known if value == one.value}
+        added = {value: one.name for value, one in known if value != one.value and id(one) in named}
+        parts.append((" further values", added))
     slots = types.MemberDescriptorType, types.GetSetDescriptorType
     own = {name: value for name, value in vars(kind).items() if name not in left_out and not isinstance(value, slots)}
     # What the user has named comes first in a reason.
@@ -369,13 +373,17 @@ def _library_object(value: Any) -> Description:
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]
     parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _without_computed(kind, state))]
     parts += [(" items", [*(items or ())]), (" entries", [*(pairs or ())])]
+    if "_hardmask" in (hidden := getattr(value, "__dict__", {})):  # of a masked array, which pickle leaves out
+        parts.append((" hard mask", hidden["_hardmask"]))
     # A method of an object is no state, but the object is.
     is_state = not isinstance(value, types.BuiltinFunctionType)
     return Description(kind.__name__, parts=parts, is_state=is_state, is_pickled=True)
 
 
 def _without_computed(kind: type, state: Any) -> Any:
-    """Return a state without what is computed from the rest when it is first needed."""
+    """Return a state without what is computed from the rest when it is first needed, and without addresses."""
+    if type(state) is tuple and any(base.__name__ == "cKDTree" for base in kind.__mro__):
+        return state[1:]  # the nodes, which are in the order of the indices that follow, point to each other
     if type(state) is tuple and len(state) == 2 and type(state[0]) is dict:
         return _without_computed(kind, state[0]), state[1]
     computed = {*cached_properties(kind), *({"_ufunc"} if (kind.__module__, kind.__name__) == _VECTORIZE else ())}
@@ -437,8 +445,8 @@ def module_reads(function: types.FunctionType) -> list[tuple[str, Any]]:
         name, value = waiting.pop()
         if isinstance(value, types.ModuleType) and value.__name__ not in seen and not is_installed(value.__name__):
             seen.add(value.__name__)
-            own = {one: part for one, part in vars(value).items() if not one.startswith("__")}
-            read = own.keys() if ATTRIBUTES_BY_TEXT & used else used & own.keys()
+            own = {one: part for one, part in vars(value).items() if not one.startswith("__") or one == "__getattr__"}
+            read = own.keys() if ATTRIBUTES_BY_TEXT & used else (used | {"__getattr__"}) & own.keys()
             new = [(f"{name}.{one}", own[one]) for one in sorted(read)]
             found += new
             waiting += new

@@ -9,8 +9,12 @@ from __future__ import annotations
 import ast
 import builtins
 import inspect
+import marshal
+import os
+import pickle
 import re
 import sys
+import traceback
 import types
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -161,8 +165,40 @@ _REFLECTING: Final = (
 )
 _REFLECTING_ATTRIBUTES: Final = frozenset(
     {"__globals__", "__builtins__", "__subclasses__", "f_globals", "f_locals", "f_builtins", "f_back", "f_lineno"}
-    | {"tb_lineno", "co_filename", "co_firstlineno", "__firstlineno__", "co_name", "co_qualname"}
+    | {"cache_info", "tb_lineno", "co_filename", "co_firstlineno", "__firstlineno__", "co_name", "co_qualname"}
 )
+
+# What these make says where a bundle's text stands, how Python keeps equal objects, or of which module a class is.
+_OF_THE_PLACE: Final = (
+    *(traceback.format_exc, traceback.format_exception, traceback.format_tb, traceback.format_stack),
+    *(traceback.extract_tb, traceback.extract_stack, traceback.TracebackException),
+    *(pickle.dump, pickle.dumps, pickle.Pickler, marshal.dump, marshal.dumps, sys.getsizeof, sys.getrefcount),
+)
+
+
+def _check_places(found: Definition, names: Mapping[str, Any]) -> None:
+    """Refuse a definition whose result depends on where its text, or an object, is."""
+    for node in ast.walk(found.node):
+        for read in (node, *_attribute_of(node, "getattr")):
+            value = evaluated(read, names) if isinstance(read, ast.Name | ast.Attribute) else None
+            if any(value is one for one in _OF_THE_PLACE):
+                text = f"{found.what} uses {ast.unparse(read)!r} ({found.place_in(node)}), whose result depends on"
+                text = f"{text} lines of the notebook, or on where objects are in memory, which a bundle has otherwise"
+                raise Refused(f"{text}. Leave it out, or take what it is made of.")
+        if not isinstance(node, ast.Compare) or not any(isinstance(one, ast.Is | ast.IsNot) for one in node.ops):
+            continue
+        for side in (node.left, *node.comparators):
+            if _is_made_again(evaluated(side, names)):
+                text = f"{found.what} compares {ast.unparse(node)!r} ({found.place_in(node)}) by 'is': equal numbers"
+                raise Refused(f"{text} and texts may be one object in a bundle and several in a notebook. Write '=='.")
+
+
+def _is_made_again(value: Any) -> bool:
+    """Whether Python may have several objects that equal this number or text; NaN is found by its identity."""
+    if type(value) is int:
+        return not -5 <= value <= 256
+    is_text = type(value) in (str, bytes) and len(value) > 1
+    return is_text or (type(value) in (float, complex) and value == value)
 
 
 def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
@@ -232,14 +268,18 @@ def check_reads(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads by reflection, or what the notebook has changed in a library's module or class."""
     names = {**sys.modules, **found.names, **imported_by(found)}
     _check_reflection(found, names)
+    _check_places(found, names)
     _check_setters(found, names)
     _check_mocks(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
     for node in ast.walk(found.node):
+        value = evaluated(node, names) if isinstance(node, ast.Name | ast.Attribute) else None
+        if (os, "environ") in known and (value is os.environ or value is os.getenv):
+            raise _patched(found.what, "os.environ", known[os, "environ"])
         if isinstance(node, ast.Name | ast.Attribute) and id(node) not in dotted:
-            owner, name, place = changed.get(id(evaluated(node, names)), (None, "", ""))
+            owner, name, place = changed.get(id(value), (None, "", ""))
             if owner is not None:
                 raise _patched(found.what, f"{owner.__name__}.{name}", place)
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
@@ -310,6 +350,8 @@ def patches_in(texts: Iterable[tuple[str, str]], names: Mapping[str, Any]) -> Pa
     for cell, text in texts:
         for written in _written_in(text):
             node = written
+            if evaluated(getattr(node, "value", node), names) is os.environ:
+                found[os, "environ"] = f"{cell}, line {written.lineno}"
             while isinstance(node, ast.Attribute | ast.Subscript):
                 owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"
