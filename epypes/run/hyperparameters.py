@@ -13,8 +13,8 @@ from epypes.run.guard import ARRAYLESS, COPIERS, keep, require_reusable
 from epypes.run.program import Program
 from epypes.run.staleness import NOT_COMPUTED, TokenManager, is_same_value, new_tokens
 
-# The revision of hyperparameters that a graph lends to a pipeline.
-_LENT: Final = -2
+# The revision of hyperparameters that a graph gives to a call of a pipeline.
+_OF_A_CALL: Final = -2
 # Of a longer value an error has dots.
 _BRIEF: Final = 40
 
@@ -172,7 +172,7 @@ class Hyperparameters:
         both, slots = {**self.entries, **entries}, self.program.slots
         plain = frozenset(token for token, (value, _) in both.items() if type(value) in ARRAYLESS and token in slots)
         # No revision follows this one.
-        made = Hyperparameters(self.program, both, _LENT, plain)
+        made = Hyperparameters(self.program, both, _OF_A_CALL, plain)
         made._seen = self._seen
         return made
 

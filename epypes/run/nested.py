@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from epypes.run.result import Run
 
 
-class Loan:
-    """What a call of a pipeline has from the graph around it, for the runs that its thread makes meanwhile.
+class NestedCall:
+    """A call of a pipeline by the graph around it: what the runs are made with that its thread makes meanwhile.
 
     Attributes
     ----------
@@ -59,20 +59,20 @@ def call_nested(step: Step, nested: NestedSlots, values: list[Any], *args: Any) 
     is_known = is_known and before.run.tokens.program is runner._program and all(place < count for place in new)
     entries = {token: values[slot] for token, slot in nested.hparams.items() if values[slot] is not NOT_COMPUTED}
     hparams = runner.current.with_entries(entries)
-    loan = Loan(hparams, args[:count], before.run if is_known else None, new)
-    loans, thread = runner.loans, get_ident()
-    outer, loans[thread] = loans.get(thread), loan
+    call = NestedCall(hparams, args[:count], before.run if is_known else None, new)
+    nested_calls, thread = runner.nested_calls, get_ident()
+    outer, nested_calls[thread] = nested_calls.get(thread), call
     try:
         if not keys:
             return step.function(*args)
         state = dict(zip(keys, args[count:], strict=True))
         value, after = getattr(step.function, CALL_WITH_STATE)(state, args[:count])
     finally:
-        values[nested.run] = NOT_COMPUTED if loan.run is None else NestedRun(loan.run)
+        values[nested.run] = NOT_COMPUTED if call.run is None else NestedRun(call.run)
         if outer is None:
-            del loans[thread]
+            del nested_calls[thread]
         else:
-            loans[thread] = outer
+            nested_calls[thread] = outer
     is_one = nested.single or not isinstance(value, tuple | list | None)
     return *((value,) if is_one else value or ()), *(after[key] for key in keys)
 

@@ -18,7 +18,7 @@ from epypes.run.execute import Executor, Way
 from epypes.run.failure import Failure, failure_of
 from epypes.run.guard import keep, lend_to_reader
 from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.nested import Loan
+from epypes.run.nested import NestedCall
 from epypes.run.plan import Plan, check_ready, plan, wanted_steps
 from epypes.run.program import MAX_UNCOUNTED, Program
 from epypes.run.result import Run, TokenMapping, TrialOf, new_run, readable_state
@@ -122,8 +122,8 @@ class CompGraphRunner(OldNames, TokenMapping):
         self._keep_times = self.reports.kept.append
         # The run that failed last on each thread: `last` may be another thread's run by then.
         self._failed = threading.local()
-        # By thread, what a graph around this one's pipeline has lent to its call.
-        self.loans: dict[int, Loan] = {}
+        # By thread, the call of this one's pipeline by a graph around it.
+        self.nested_calls: dict[int, NestedCall] = {}
         # Held by a run with state: the next one begins with what it leaves.
         self._series = threading.RLock()
 
@@ -168,32 +168,32 @@ class CompGraphRunner(OldNames, TokenMapping):
         start_ns = perf_counter_ns()
         if targets:
             self._require_targets(targets)
-        if self.loans and (loan := self.loans.get(get_ident())) is not None:
-            return self._run_lent(loan, payload, targets, start_ns)
+        if self.nested_calls and (call := self.nested_calls.get(get_ident())) is not None:
+            return self._run_nested(call, payload, targets, start_ns)
         hparams = self.current if self._program.nested else self._hparams
         if not self._program.states:
             return self._run(hparams.tokens(payload, ()), hparams, targets, start_ns)
         with self._series:
             return self._run(hparams.tokens(payload, self._kept), hparams, targets, start_ns)
 
-    def _run_lent(self, loan: Loan, payload: Payload, targets: Sequence[str], start_ns: int) -> Run:
-        """Run with what a graph has lent to the pipeline of this one, on from its last call."""
+    def _run_nested(self, call: NestedCall, payload: Payload, targets: Sequence[str], start_ns: int) -> Run:
+        """Run with what a graph gives to this one's pipeline, on from its last call."""
         __tracebackhide__ = True
-        hparams, before, is_passed_on = loan.hparams, loan.before, loan.is_passed_on(payload)
+        hparams, before, is_passed_on = call.hparams, call.before, call.is_passed_on(payload)
         if before is not None and is_passed_on and [*before.hparams.free_slots] == [*payload]:
             changes = dict(hparams.changes_since(before.hparams))
-            new = {token: value for place, (token, value) in enumerate(payload.items()) if place in loan.new}
+            new = {token: value for place, (token, value) in enumerate(payload.items()) if place in call.new}
             tokens = before.tokens.branch(changes | new, unsure=new)
             del before
         else:
             tokens = hparams.tokens(payload, self._kept)
-        loan.before = None
+        call.before = None
         try:
             run = self._run(tokens, hparams, targets, start_ns)
         except BaseException as error:
-            loan.run = self.failed_run(error) if is_passed_on else None
+            call.run = self.failed_run(error) if is_passed_on else None
             raise
-        loan.run = run if is_passed_on else None
+        call.run = run if is_passed_on else None
         return run
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
