@@ -7,7 +7,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.errors import NotComputed, StaleToken
+from epypes.errors import NotComputed, StaleToken, UnknownName
 from epypes.graph import CompGraph, redefined
 from epypes.nothing import Nothing
 from epypes.rich_display import mimebundle
@@ -154,6 +154,9 @@ class Run(TokenMapping):
         if slot is not None and tokens.has_payload and 1 not in tokens.dirty:
             value = tokens.values[slot]
             return value if type(value) in READ_AS_STORED or not program.guard else lend(value)
+        if slot is None and (inside := self._place_inside(token)):
+            advice = f" What is inside a pipeline is in its run: {inside}."
+            raise UnknownName("token", token, self.cg.tokens, advice=advice)
         try:
             return tokens.read(token)
         except StaleToken:
@@ -163,6 +166,14 @@ class Run(TokenMapping):
                 raise
             text = f"Token {token!r} has not been computed, since {self.failure}."
             raise NotComputed(token, text) from error
+
+    def _place_inside(self, token: object) -> str:
+        """Return the expression for a token of a nested pipeline; empty if none has it."""
+        for function, nested in self.tokens.program.nested.items():
+            name = str(token).removeprefix(f"{function}__")
+            if nested.runner.cg.has_token(name):
+                return f"run.nested[{function!r}][{name!r}]"
+        return ""
 
     def __iter__(self) -> Iterator[str]:
         tokens = self.tokens

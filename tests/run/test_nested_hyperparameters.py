@@ -215,6 +215,9 @@ def test_a_run_remembers_what_was_inside(runner, geometry):
     assert later.nested["geometry"]["inliers"] == 18
     assert later.nested["geometry"].report.ran == ("ransac", "measure")
     assert later.nested["geometry"].hyperparameters["offset"] == 0
+    for name in ("inliers", "geometry__inliers"):
+        with pytest.raises(UnknownName, match=r"run\.nested\['geometry'\]\['inliers'\]"):
+            run[name]
 
 
 def test_a_failure_inside_is_found_and_gone_on_from(counted):

@@ -75,7 +75,9 @@ def save(
             raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
         _replace(file.resolve(), text)
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links; a zero byte in the name
-        raise SettingsError(file, [f"{file} can't be written: {error}. Name another file."]) from error
+        # Not the name of the draft that is written first.
+        reason = getattr(error, "strerror", None) or error
+        raise SettingsError(file, [f"{file} can't be written: {reason}. Name another file."]) from error
     return file
 
 
