@@ -188,7 +188,7 @@ class _Reactive(Pipeline):
 
     def _is_own(self, hook: str) -> bool:
         """Whether a hook is that of a user's subclass, or was set on this object."""
-        return hook in vars(self) or not getattr(type(self), hook).__module__.startswith("epypes.pipeline.")
+        return hook in vars(self) or not getattr(type(self), hook).__module__.startswith("epypes.")
 
     def _note_failure(self, where: str, failure: Failure) -> None:
         """Remember for the picture where the last event failed."""

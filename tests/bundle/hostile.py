@@ -246,6 +246,10 @@ REFUSED: dict[str, tuple[str, str, str]] = {
         "N = 2\ndef d(g):\n    @functools.wraps(g)\n    def w(a, n=N):\n        return g(a) * n\n    return w\n@d\ndef f(a):\n    return a\nN = 3", "f",
         r"'f' \(cell \[1\], line 7\): its default of 'n' is 2 in the notebook and 3",
     ),
+    "function with others for other types": (
+        "@functools.singledispatch\ndef f(a):\n    return a\n@f.register(float)\ndef _(a):\n    return 1", "f",
+        r"'f' \(cell \[1\], line 1\): its attribute 'registry' keys has \[1\] only in the notebook",
+    ),
     "library's decorator with a changed argument": (
         "N = 2\n@functools.lru_cache(N)\ndef f(a):\n    return a\nN = 3", "f", r"'f' \(cell \[1\], line 2\): its parameters\['maxsize'\] is 2 in the notebook and 3",
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tracemalloc
+import gc
 
 import cv2
 import numpy as np
@@ -110,14 +110,15 @@ def test_an_input_that_was_written_into_after_the_run_is_not_blamed_on_random_nu
 
 def test_a_function_that_fails_the_second_time_is_named(tmp_path):
     source = (
-        "import tracemalloc\ndef once(x):\n    if tracemalloc.is_tracing():\n        raise ValueError('only once')\n"
-        "    tracemalloc.start()\n    return x\n"
+        "import gc\ndef once(x):\n    if gc.get_threshold()[0] == 1717:\n        raise ValueError('only once')\n"
+        "    gc.set_threshold(1717)\n    return x\n"
     )
+    threshold = gc.get_threshold()
     runner = ep.CompGraphRunner(ep.CompGraph.from_functions(notebook(source)["once"]))
     try:
         runner.run(x=X)
     finally:
-        tracemalloc.stop()
+        gc.set_threshold(*threshold)
     with pytest.raises(PromotionRefused, match=r"pipeline.py, line \d+: raise ValueError.*only once"):
         ep.promote(runner, tmp_path / "bundle")
 

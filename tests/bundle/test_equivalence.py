@@ -93,11 +93,6 @@ PROMOTED: dict[str, tuple[str, ...]] = {
         "class C:\n    K = 2\ndef f(a, *, k=C.K, l=len('abc')):\n    return a * k + l\nclass C:\n    K = 3",
     ),
     "default that is an array": ("K = np.array([1.5, 2, 3, 4])\ndef f(a, k=K):\n    return a * k\nK = None",),
-    "property that fails, and a cached one that was computed": (
-        "import dataclasses\n@dataclasses.dataclass\nclass Lut:\n    k: int\n    @functools.cached_property\n    def inverse(self):\n        return np.arange(4) * self.k\n"
-        "    @property\n    def port(self):\n        raise ValueError('no camera')\nLUT = Lut(3)\nLUT.inverse\n"
-        "def f(a):\n    return LUT.port if a.max() > 1e9 else a * LUT.inverse",
-    ),
     "default that is a function": ("def g(a):\n    return a + 1\ndef f(a, g=g):\n    return g(a)\ndef g(a):\n    return a + 2",),
     "default of a NamedTuple": (f"import typing\n{BOX}{BOXED}",),
     "default of a NamedTuple under a name": (

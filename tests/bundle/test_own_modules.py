@@ -394,21 +394,6 @@ HOSTILE = {
         r"'f' of module 'lib' uses 'input'",
     ),
     "the notebook as a module": ("import __main__\ndef f(x):\n    return x\n", "", r"imports the notebook itself"),
-    "what a module computes of what the notebook replaces": (
-        "K = [2]\ndef __getattr__(name):\n    if name != 'GAIN':\n        raise AttributeError(name)\n    return K[0]\ndef f(x):\n    import lib\n    return x * lib.GAIN\n",
-        "lib.K.__setitem__(0, 3)",
-        r"'K'\[0\] is 3 in the notebook and 2 in the module",
-    ),
-    "a flag that the notebook sets": (
-        "import threading\nREADY = threading.Event()\ndef f(x):\n    return x if READY.is_set() else -x\n",
-        "lib.READY.set()",
-        r"'READY' state\['_flag'\] is True in the notebook and False in the module",
-    ),
-    "a mask that the notebook hardens": (
-        "import numpy as np\nM = np.ma.masked_less(np.arange(4.0), 2)\ndef f(x):\n    m = M.copy()\n    m[0] = 1\n    return x * m.sum()\n",
-        "lib.M.harden_mask()",
-        r"'M' hard mask is True in the notebook and False in the module",
-    ),
     "code that the notebook replaces": (
         "def g(x):\n    return x\ndef f(x):\n    return g(x)\n",
         "vars(lib)['g'].__code__ = (lambda x: 3 * x).__code__",
@@ -450,18 +435,6 @@ def test_modules_that_are_no_plain_files_are_refused(project, tmp_path, monkeypa
         r"Module 'statistics' \(.*project/statistics\.py\) has the name of a module of Python.*Rename it", reasons
     )
     assert re.search(r"Module 'compiled' is no file of Python text .*install its package", reasons)
-
-
-@SLOW
-def test_trees_of_points_are_promoted(project):
-    """What SciPy keeps of them has addresses."""
-    project.write(
-        lib="import numpy as np\nfrom scipy.spatial import KDTree, cKDTree\nP = np.random.default_rng(3).random((40, 2))\n"
-        "A, B = cKDTree(P), KDTree(P)\ndef f(x):\n    return x + B.query(A.query(x[0, :2])[0] * x[:, :2])[0].sum()\n"
-    )
-    runner, other = ep.load(project.promote("import lib", f="lib.f")), np.linspace(0, 1, 6).reshape(2, 3)
-    again = project.runner("import lib", f="lib.f", x=other)
-    assert np.array_equal(runner.run(x=other)["f_made"], again["f_made"])
 
 
 @SLOW

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 import sys
 from collections.abc import Iterator, Mapping
-from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final
@@ -19,13 +17,6 @@ ON_EVERY_MACHINE: Final = (
     *("/System", "/Library", "/var/cache", "/var/lib"),
 )
 _EVENTS: Final = frozenset({"open", "os.listdir", "os.scandir", "sqlite3.connect"})
-# Functions and methods that write files, and modes of those that may.
-_WRITERS: Final = frozenset(
-    {"copyfile", "copytree", "imsave", "imwrite", "imwritemulti", "makedirs", "mkdir", "rmtree", "save", "savefig"}
-    | {"savetxt", "savez", "savez_compressed", "symlink", "to_csv", "to_excel", "to_hdf", "to_parquet", "to_pickle"}
-    | {"tofile", "touch", "unlink", "write_bytes", "write_text"}
-)
-_WRITING_MODE: Final = re.compile(r"[rbtU+]*[wax+][rbtU+]*")
 _WAY_OUT: Final = (
     "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
     "it into the data of a package that is installed and read it with importlib.resources."
@@ -125,21 +116,6 @@ class FileAccess:
                 return f"{'The module' if name == '<module>' else f'{name}()'} ({where})"
             frame = frame.f_back
         return ""
-
-
-@cache
-def writing_calls(file: Path) -> dict[int, str]:
-    """Return the calls in a file of Python text that write files, by their lines."""
-    calls = (node for node in ast.walk(ast.parse(file.read_bytes())) if isinstance(node, ast.Call))
-    found: dict[int, str] = {}
-    for call in calls:
-        name = getattr(call.func, "attr", getattr(call.func, "id", ""))
-        given = [*call.args, *(part.value for part in call.keywords if part.arg == "mode")]
-        modes = [str(part.value) for part in given if isinstance(part, ast.Constant)]
-        is_open = name == "open" and any(_WRITING_MODE.fullmatch(mode) for mode in modes)
-        if is_open or name in _WRITERS:
-            found |= dict.fromkeys(range(call.lineno, (call.end_lineno or call.lineno) + 1), ast.unparse(call.func))
-    return found
 
 
 def named_here(folder: Path) -> list[str]:

@@ -19,12 +19,10 @@ import hashlib
 import inspect
 import sys
 import types
-from abc import ABCMeta
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from epypes.bundle.proof.process_settings import OF_NOTEBOOKS
-from epypes.bundle.source.objects import registered_classes
 from epypes.run.snapshot import is_own
 
 Attributes = Mapping[str, Mapping[str, str]]
@@ -39,8 +37,6 @@ OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "ep
 # A name in modules that pytest has compiled otherwise, as it does with tests and plugins.
 _OF_PYTEST: Final = "@pytest_ar"
 _OWN: Final = ("__main__.", "unittest.mock.")
-# OpenCV keeps the last error in attributes of its class.
-_OF_ERRORS: Final = "cv2", "error."
 _ALWAYS: Final = frozenset({"builtins", "numpy"})
 
 
@@ -97,10 +93,9 @@ def changed_attributes(
                 # Not what a loop over a set has left behind in a module, nor what libraries do to each other.
                 is_changed = last.isupper() or "." in name or last in mentioned or f".{last}" in other
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
-                is_changed &= "." not in name or not _is_object_of(module, value, other)
                 is_changed |= last in named_here and name not in _left_by_loops(module)
                 is_changed &= other != value and (other != "None" or last in named_here)
-                is_changed &= not value.startswith(OF_NOTEBOOKS) and (module, name[:6]) != _OF_ERRORS
+                is_changed &= not value.startswith(OF_NOTEBOOKS)
             if is_changed:
                 found[module, name] = value, other
     return found
@@ -115,11 +110,6 @@ def _left_by_loops(module: str) -> frozenset[str]:
         return frozenset()
     parts = (part for loop in tree.body if isinstance(loop, ast.For) for part in ast.walk(loop))
     return frozenset(part.id for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
-
-
-def _is_object_of(module: str, *values: str) -> bool:
-    """Whether these describe objects or classes of a module's own package, as its own functions exchange them."""
-    return all(value.startswith(f"{module.partition('.')[0]}.") and " " not in value for value in values)
 
 
 def _mentioned(text: str) -> set[str]:
@@ -143,9 +133,6 @@ def _attributes(owner: Any, home: str, prefix: str = "") -> Iterator[tuple[str, 
             continue
         yield f"{prefix}{name}", _described(value)
         if isinstance(value, type) and value.__module__ == home and value.__qualname__ == f"{prefix}{name}":
-            if isinstance(value, ABCMeta):
-                own = [one.__qualname__ for one in registered_classes(value) if is_own(one.__module__)]
-                yield f"{prefix}{name}.register", f"own classes {sorted(set(own))}"
             yield from _attributes(value, home, f"{prefix}{name}.")
         elif type(value) is dict and len(value) <= _MOST_ENTRIES:
             entries = ((key, entry) for key, entry in value.items() if type(key) in (str, int))

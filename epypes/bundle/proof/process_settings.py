@@ -20,8 +20,6 @@ from contextlib import suppress
 from contextvars import Context, copy_context
 from typing import Any, Final, NamedTuple
 
-from epypes.run.snapshot import is_global_generator, is_own
-
 # Only where a function catches warnings, errors in their place change what it computes.
 WARNINGS: Final = "warnings.simplefilter"
 # What the name of a variable of the context follows.
@@ -30,12 +28,8 @@ CONTEXT_VARIABLE: Final = "ContextVar "
 OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "pydevd", "_pydev", "nest_asyncio")
 
 
-# Functions of OpenCV that draw from its generator; methods of SciPy and pandas that draw from NumPy's, unless they are
-# given another one.
-_DRAWS_OF_CV2: Final = frozenset({"randu", "randn", "randShuffle"})
-DRAWING_METHODS: Final = frozenset({"rvs", "sample"})
-_SEEDS: Final = frozenset({"seed", "setstate", "set_state", "setRNGSeed"})
 # Code with one of these names may draw from a generator of the whole process, unless it makes its own.
+_DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
 _OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
 
 
@@ -200,18 +194,6 @@ def _set_environment(os: Any, variables: Mapping[bytes, bytes]) -> None:
     time.tzset()  # C code has its own copy of TZ
 
 
-def _set_dialects(csv: Any, dialects: Mapping[str, Any]) -> None:
-    for name in {*csv.list_dialects()} - dialects.keys():
-        csv.unregister_dialect(name)
-    for name, dialect in dialects.items():
-        csv.register_dialect(name, dialect)
-
-
-def _pickling_text(table: Mapping[type, Any]) -> dict[str, str]:
-    own = {one.__qualname__ for one in table if one.__module__ in sys.modules and is_own(one.__module__)}
-    return {"copyreg.pickle": f"{sorted(own)}"}
-
-
 def _of_functions(name: str, getter: str, words: str = "", by_keyword: bool = False, **more: Any) -> Setting:
     """Return a setting that one function of a module reads and another one, which gives it its name, writes."""
     module, _, setter = name.rpartition(".")
@@ -247,43 +229,6 @@ SETTINGS: Final = (
     Setting("decimal.getcontext", "decimal", _decimal_reader, _set_decimal, frozenset({"decimal"}), _decimal_text),
     # From NumPy 2 on these are variables of the context, which are all compared.
     _of_functions("numpy.seterr", "geterr", "seterr", by_keyword=True, texts=_errors_text, is_quiet=_raises_as),
-    _of_functions(
-        "scipy.special.seterr",
-        "geterr",
-        "seterr special",
-        by_keyword=True,
-        texts=lambda errors: {"scipy.special.seterr": f"{sorted(one for one in errors if errors[one] == 'raise')}"},
-    ),
-    _of_functions(
-        "calendar.setfirstweekday",
-        "firstweekday",
-        "calendar",
-        texts=lambda day: {"calendar.setfirstweekday": f"{int(day)}"},
-    ),
-    Setting(
-        "csv.field_size_limit",
-        "csv",
-        operator.attrgetter("field_size_limit"),
-        lambda csv, size: csv.field_size_limit(size),
-        frozenset({"csv"}),
-        lambda size: {"csv.field_size_limit": f"{size}"},
-    ),
-    Setting(
-        "csv.register_dialect",
-        "csv",
-        lambda csv: lambda: {name: csv.get_dialect(name) for name in csv.list_dialects()},
-        _set_dialects,
-        frozenset({"csv"}),
-        lambda dialects: {"csv.register_dialect": f"{sorted(dialects)}"},
-    ),
-    Setting(
-        "copyreg.pickle",
-        "copyreg",
-        lambda copyreg: lambda: dict(copyreg.dispatch_table),
-        lambda copyreg, table: (copyreg.dispatch_table.clear(), copyreg.dispatch_table.update(table)),
-        frozenset({"copyreg"}),
-        _pickling_text,
-    ),
     _of_functions("numpy.set_printoptions", "get_printoptions", "set_printoptions", by_keyword=True, texts=_print_text),
     Setting(
         "pandas.set_option",
@@ -375,23 +320,6 @@ class ProcessSettings:
         return self.is_known()
 
 
-def draws_or_seeds(value: Any) -> tuple[bool, bool]:
-    """Return whether a function draws from a random generator of the whole process, and whether it seeds one."""
-    name = getattr(value, "__name__", "")
-    # Three functions of numpy.random are no methods of its generator.
-    is_function = name in ("seed", "ranf", "sample") and value is getattr(sys.modules.get("numpy.random"), name, None)
-    is_method = is_function or is_global_generator(getattr(value, "__self__", None))
-    is_of_cv2 = name in _DRAWS_OF_CV2 | _SEEDS and value is getattr(sys.modules.get("cv2"), name, None)
-    is_seed = (is_method or is_of_cv2) and name in _SEEDS
-    return (is_method or is_of_cv2) and not is_seed, is_seed
-
-
-def are_drawn_by(words: AbstractSet[str]) -> bool:
-    """Whether code with these names may draw from a random generator of the whole process."""
-    is_named = "random" in words and words.isdisjoint(_OWN_GENERATORS)
-    return is_named or "kmeans" in words or not words.isdisjoint(DRAWING_METHODS)
-
-
 class GlobalGenerators:
     """The random generators of the whole process, which begin each event as they were when the bundle was loaded.
 
@@ -406,6 +334,11 @@ class GlobalGenerators:
         self._numpy = sys.modules.get("numpy.random")
         self._first = random.getstate(), self._numpy.get_state() if self._numpy else None
         self._local = threading.local()
+
+    @staticmethod
+    def are_drawn_by(words: AbstractSet[str]) -> bool:
+        """Whether code with these names may draw from them."""
+        return not words.isdisjoint(_DRAWS) and words.isdisjoint(_OWN_GENERATORS)
 
     def begin(self, name: str) -> None:
         """Note that a function is called which may draw from them; put them back where an event begins."""

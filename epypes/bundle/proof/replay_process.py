@@ -36,15 +36,12 @@ from epypes.bundle.manifest import (
     recorded_environment,
 )
 from epypes.bundle.proof.compare import Difference, differences
-from epypes.bundle.proof.file_access import FileAccess, writing_calls
+from epypes.bundle.proof.file_access import FileAccess
 from epypes.bundle.proof.fingerprint import Digester
 from epypes.bundle.proof.libraries import library_attributes
-from epypes.bundle.proof.mutable_state import draws_without_seed
 from epypes.bundle.proof.process_settings import GlobalGenerators, library_settings
 from epypes.bundle.proof.replay import ReplayReport, record_again, replay
 from epypes.bundle.requirements import fresh_environment, imported_names, pins, read_pins, requirement_lines
-from epypes.bundle.source.own_modules import functions_reached_by
-from epypes.bundle.source.references import nested_codes
 from epypes.bundle.source.resolve import evaluated
 from epypes.errors import BundleChanged, BundleError, EpypesError, ReplayDiffers
 from epypes.run.guard import as_written
@@ -111,16 +108,7 @@ def replay_isolated(
         try:
             # Isolated as by -I, which would also have it overlook PYTHONHASHSEED.
             done = subprocess.run(  # noqa: S603 - an interpreter, a module of ours
-                [
-                    python,
-                    "-s",
-                    "-P",
-                    "-m",
-                    "epypes.bundle.proof.replay_process",
-                    str(folder.resolve()),
-                    str(out),
-                    *options,
-                ],
+                [python, "-s", "-P", "-m", _PROGRAM, str(folder.resolve()), str(out), *options],
                 cwd=cwd or scratch,
                 env=without_python() if environment is None else environment,
                 stdin=subprocess.DEVNULL,
@@ -186,7 +174,7 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
         _load_named(text, own)
     return replace(
         report,
-        outside=(*access.files, *draws_without_seed(bundle.cg.functions), *_unproved_writes(bundle, ran)),
+        outside=access.files,
         requirements=requirement_lines(named | new),
         libraries=library_attributes(named, new) if with_libraries else {},
         notes=_unproved_lines(ran, folder),
@@ -277,22 +265,6 @@ def _unproved_lines(ran: Mapping[CodeType, Collection[int]], folder: Path) -> li
             text = f"No sample runs these lines of {name}, so no replay proves them: {named}{more}."
             found.append(f"{text} Give payloads that do: samples=[...].")
     return found
-
-
-def _unproved_writes(bundle: Bundle, ran: Mapping[CodeType, Collection[int]]) -> list[str]:
-    """Return as sentences which calls that write files no sample runs: what a later event reads of them is state."""
-    found = []
-    for function in functions_reached_by([*bundle.cg.functions.values(), *bundle.own.values()]):
-        file = Path(function.__code__.co_filename)
-        writes = writing_calls(file) if file.is_relative_to(bundle.path) else {}
-        for code in nested_codes(function.__code__) if writes else ():
-            missed = {line for _, _, line in code.co_lines() if line} - set(ran.get(code, ()))
-            found += [
-                f"{code.co_name}() writes a file by {writes[line]!r} ({file.relative_to(bundle.path).as_posix()}, line "
-                f"{line}), which no sample runs. Give a payload that does: samples=[...]; or leave it out."
-                for line in sorted(missed & writes.keys())
-            ]
-    return list(dict.fromkeys(found))
 
 
 # -- verification ---------------------------------------------------------------------------------------------------

@@ -16,16 +16,13 @@ import ast
 import dataclasses
 import functools
 import linecache
-import math
 import reprlib
-import sys
 import tempfile
 import traceback
 import types
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path, PurePath
 from typing import Any, Final
 
@@ -41,16 +38,14 @@ from epypes.bundle.source.objects import (
     describe,
     is_installed,
     is_of_library,
-    is_unset,
     module_reads,
     without_nodes,
 )
 from epypes.bundle.source.own_modules import OwnModules
-from epypes.bundle.source.references import meanings_of, namespace_of, nested_codes
+from epypes.bundle.source.references import meanings_of, nested_codes
 from epypes.bundle.source.resolve import (
     annotated_names,
     definition_of,
-    evaluated,
     layers,
     place_in,
     place_of,
@@ -59,10 +54,9 @@ from epypes.bundle.source.resolve import (
 )
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
-from epypes.run.snapshot import cached_properties
 
 # By these a function reads annotations or docstrings, which otherwise change nothing.
-_ANNOTATIONS: Final = frozenset(
+_READS_ANNOTATIONS: Final = frozenset(
     {
         "__annotations__",
         "__doc__",
@@ -74,10 +68,6 @@ _ANNOTATIONS: Final = frozenset(
         "fields",
     }
 )
-# Code that writes a class as text, with the name of its module.
-_TEXT_OF_CLASS: Final = "str of a class"
-# How Python calls a function or a class. What functions read of classes alone has the second name.
-_NAMES: Final = {name: f"{name} of a class" for name in ("__name__", "__qualname__", "__module__")}
 _DRAFT: Final = "epypes-draft-"
 _WAY_OUT: Final = (
     "The bundle has what the text of the cells makes by now. Run the cells that make it again, or make it a token. "
@@ -172,23 +162,18 @@ class _Walk:
         self.waiting: deque[tuple[_Path, Any, Any]] = deque()
         # The objects by their ids. They are kept here, so that no id is used again.
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
-        # What a module imports as NaN is the same object everywhere.
-        known = {id(module.nan): module.nan for module in (math, sys.modules.get("numpy")) if module is not None}
-        self._partners: tuple[dict[int, Any], dict[int, Any]] = {**known}, {**known}
+        self._partners: tuple[dict[int, Any], dict[int, Any]] = {}, {}
         self._divided: dict[bool, _Different] = {}
-        self._asks_for_identity = self._asks_for_membership = False
+        self._asks_for_identity = self._asks_for_membership = self._asks_for_annotations = False
         self._last: _Different | None = None  # raised if there is no other one
-        # The names by which functions ask, and what counts only where a function has one of some names: annotations,
-        # docstrings, and how Python calls an object and its module.
-        self._words: set[str] = set()
-        self._asked: list[tuple[frozenset[str], _Path, dict[str, Any], dict[str, Any]]] = []
+        # The annotations and docstrings of pairs of objects, which count only where a function reads them.
+        self._annotations: list[tuple[_Path, dict[str, Any], dict[str, Any]]] = []
 
     def finish(self) -> None:
         """Compare all that is waiting and what it reaches; raise at the first difference."""
-        while self.waiting or any(asked := [one for one in self._asked if one[0] & self._words]):
+        while self.waiting or (self._asks_for_annotations and self._annotations):
             if not self.waiting:
-                self._asked.remove(asked[0])
-                self._add_all(*asked[0][1:])
+                self._add_all(*self._annotations.pop())
                 continue
             path, ours, theirs = self.waiting.popleft()
             ours, theirs = without_nodes(ours), without_nodes(theirs)
@@ -222,12 +207,10 @@ class _Walk:
         for side, (one, other) in enumerate(((ours, theirs), (theirs, ours))):
             if self._partners[side].setdefault(id(one), other) is not other:
                 where, elsewhere = _side(side == 0), _side(side == 1)
-                text = f"{path.name} is one object in the {where} and several in the {elsewhere}"
-                if is_atom:
-                    nan = _Different(path, f"{text}, and NaN is found and compared by its identity. Use np.nan.")
-                    self._last = self._last or nan
-                text = f"{text}, and a function compares by 'is' or 'in', or copies deeply."
-                self._divided.setdefault(has_equals, _Different(path, text))
+                text = f"{path.name} is one object in the {where} and several in the {elsewhere}, and a function"
+                self._divided.setdefault(
+                    has_equals, _Different(path, f"{text} compares by 'is' or 'in', or copies deeply.")
+                )
 
     def _compare(self, path: _Path, ours: Any, theirs: Any) -> None:
         """Compare two objects but for their parts, which are then waiting."""
@@ -235,7 +218,6 @@ class _Walk:
             is_installed_module = isinstance(ours, types.ModuleType) and is_installed(ours.__name__)
             if is_installed_module or isinstance(ours, CompGraphRunner):
                 raise TypeError("what a module holds, and a runner's last run, is no part of its description")
-            _compute_cached(ours, theirs)
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
             text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."
@@ -262,28 +244,13 @@ class _Walk:
             names = [name for node in nodes for name in vars(node) if is_set_by_runs(node, name)]
             left_out += tuple(f" attribute {name!r}" for name in names)
         parts, others_parts = dict(mine.parts), dict(others.parts)
-        if mine.is_pickled:
-            lazy = _computed_lazily(parts[" state"], others_parts[" state"])
-            parts[" state"], others_parts[" state"] = (
-                {name: part for name, part in side[" state"].items() if name not in lazy} if lazy else side[" state"]
-                for side in (parts, others_parts)
-            )
         self._add_all(path, _without(parts, left_out), _without(others_parts, left_out))
-        self._asked.append((_ANNOTATIONS, path, _annotations_in(parts), _annotations_in(others_parts)))
-        self._compare_names(path, ours, theirs)
+        self._annotations.append((path, _annotations_in(parts), _annotations_in(others_parts)))
         if isinstance(ours, types.FunctionType) and not is_of_library(ours):
             read, others_read = ({f" {name!r}": part for name, part in module_reads(one)} for one in (ours, theirs))
             # Of a package, the notebook may have modules that no code of the bundle imports.
             extra = {name for name in read.keys() - others_read if isinstance(read[name], types.ModuleType)}
             self._add_all(path, {name: part for name, part in read.items() if name not in extra}, others_read)
-
-    def _compare_names(self, path: _Path, ours: Any, theirs: Any) -> None:
-        """Note how Python calls two functions or classes of the user, where it calls them otherwise."""
-        for word, word_of_class in _NAMES.items():
-            mine, others = ({f" {word!r}, which a function reads,": _named_by(word, one)} for one in (ours, theirs))
-            if mine != others:
-                words = {word, word_of_class, _TEXT_OF_CLASS} if isinstance(ours, type) else {word}
-                self._asked.append((frozenset(words), path, mine, others))
 
     def _add_all(self, path: _Path, mine: Mapping[str, Any], others: Mapping[str, Any]) -> None:
         """Add parts by name, which must be the same in the same order."""
@@ -304,7 +271,7 @@ class _Walk:
         if node is None or other is None or not _is_same_text(ours.__code__, node, theirs.__code__, other):
             raise _Different(path, "the notebook has it with another text than the cells have now.")
         parts = [*ast.walk(node)]
-        self._words |= _words_of(parts, ours)
+        self._asks_for_annotations |= not _READS_ANNOTATIONS.isdisjoint(_names(ours.__code__))
         self._asks_for_identity |= any(map(_asks_for_identity, parts))
         self._asks_for_membership |= any(isinstance(part, ast.In | ast.NotIn) for part in parts)
         # What an annotation names need not be there, and is not in the instructions where annotations are read late.
@@ -349,65 +316,6 @@ def _without(parts: Mapping[str, Any], left_out: tuple[str, ...]) -> dict[str, A
 
 def _annotations_in(parts: Mapping[str, Any]) -> dict[str, Any]:
     return {label: part for label, part in parts.items() if label.startswith(ANNOTATION)}
-
-
-def _named_by(word: str, value: Any) -> Any:
-    """Return an attribute that says how Python calls a function or class of the user; of a method, also those in it."""
-    if not isinstance(value, types.FunctionType | type) or is_installed(str(value.__module__)):
-        return None
-    if word != "__qualname__" or isinstance(value, type):
-        return getattr(value, word)
-    return value.__qualname__, *(code.co_qualname for code in nested_codes(value.__code__))
-
-
-def _words_of(parts: Iterable[ast.AST], function: types.FunctionType) -> set[str]:
-    """Return the names and texts that a function has, but for those of ``_NAMES`` that it reads of classes alone."""
-    code, names = function.__code__, namespace_of(function)
-    texts = {text for inner in nested_codes(code) for text in inner.co_consts if type(text) is str}
-    reads = [part for part in parts if isinstance(part, ast.Attribute) and part.attr in _NAMES]
-    of_classes = {part.attr for part in reads if _is_class(part.value, names)}
-    others = {part.attr for part in reads if not _is_class(part.value, names)} | texts
-    # The body of a class has two of these names, which it does not read.
-    found = (_names(code) - _NAMES.keys()) | others | {_NAMES[name] for name in of_classes}
-    return found | {_TEXT_OF_CLASS for part in parts if any(_is_class(one, names) for one in _texts_made_of(part))}
-
-
-def _is_class(node: ast.expr, names: Mapping[str, Any]) -> bool:
-    """Whether an expression is a class: ``type(blob)``, ``blob.__class__``, ``Blob``."""
-    is_call = isinstance(node, ast.Call) and getattr(node.func, "id", "") == "type"
-    return is_call or getattr(node, "attr", "") == "__class__" or isinstance(evaluated(node, names), type)
-
-
-def _texts_made_of(node: ast.AST) -> list[ast.expr]:
-    """Return the expressions that a part of a function writes as text: ``f"{blob}"``, ``str(blob)``."""
-    written: list[ast.expr] = []
-    if isinstance(node, ast.FormattedValue):
-        written = [node.value]
-    elif isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("str", "repr", "format", "ascii"):
-        written = node.args[:1]
-    elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "format":
-        written = [*node.args, *(given.value for given in node.keywords)]
-    elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mod):
-        written = node.right.elts if isinstance(node.right, ast.Tuple) else [node.right]
-    return written
-
-
-def _compute_cached(ours: Any, theirs: Any) -> None:
-    """Have an object of the user compute what the notebook's object has kept of its cached properties."""
-    for name in cached_properties(type(ours)) & getattr(ours, "__dict__", {}).keys() if ours is not theirs else ():
-        with suppress(Exception):  # the notebook's object computed it before it was changed
-            getattr(theirs, name)
-
-
-def _computed_lazily(ours: Any, theirs: Any) -> set[str]:
-    """Return the private attributes of a library's object that it has computed in the notebook, and not yet here."""
-    if type(ours) is not dict or type(theirs) is not dict:
-        return set()
-    unset = {name for name in {**ours, **theirs} if str(name)[:1] == "_" and is_unset(theirs.get(name))}
-    computed = {name for name in unset if not is_unset(ours.get(name))}
-    # Beside something that was computed, a flag may say so; alone it is a setting, as in an Event.
-    is_set = all(ours[name] is True and theirs.get(name) is False for name in computed)
-    return unset - computed if is_set else unset
 
 
 def _has_nan(key: Any) -> bool:

@@ -16,13 +16,13 @@ import types
 import unicodedata
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from datetime import date, datetime, timedelta, timezone
+from datetime import timedelta
 from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
-from epypes.bundle.source.resolve import Importable, Refused, importable, names_of
+from epypes.bundle.source.resolve import Importable, Refused, importable
 from epypes.nothing import Nothing
 from epypes.run.guard import is_plain_array
 
@@ -217,10 +217,6 @@ class _Writer:
             return source
         if type(value) in (tuple, list, dict):
             return bracketed(value, self.write)
-        # A list finds NaN by its identity.
-        nan = importable(value, "nan") if type(value) is float and value != value else None
-        if nan is not None:
-            return self.gathered.reference(nan, self.what)
         call = _call_of(value)
         if call is not None:
             made_by, arguments = call
@@ -252,7 +248,7 @@ class _Writer:
             return f"{self.write(origin)}[{'...' if given == [...] else self.write(given)}, {self.write(result)}]"
         if origin is not None:
             return f"{self.write(origin)}[{self._joined(value.__args__)}]"
-        home = importable(value, *names_of(value, vars(types)))
+        home = importable(value)
         if home is not None:
             return gathered.reference(home, what)
         if isinstance(value, type):
@@ -309,30 +305,17 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         flags = re.RegexFlag(value.flags & ~re.UNICODE)
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
-        return pathlib.Path if isinstance(value, pathlib.Path) else kind, (str(value),)
-    if kind is timezone:
-        return kind, value.__getinitargs__()
-    if kind in (date, datetime) and not getattr(value, "fold", 0):
-        of_time = (value.microsecond, value.tzinfo) if isinstance(value, datetime) else ()
-        return kind, (*value.timetuple()[: 6 if of_time else 3], *of_time)
-    if kind is types.MappingProxyType:
-        return kind, (dict(value),)
+        return pathlib.Path, (str(value),)
     if kind in _KNOW_THEIR_CALL:
         made_by, arguments = value.__reduce__()[:2]
         return made_by, arguments
-    return _call_of_numpy(value) if kind.__module__.partition(".")[0] == "numpy" else None
+    if kind.__module__.partition(".")[0] == "numpy":
+        import numpy as np
 
-
-def _call_of_numpy(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
-    import numpy as np
-
-    kind = type(value)
-    if isinstance(value, np.dtype):
-        return np.dtype, (value.str if value.names is None else value.descr,)
-    if isinstance(value, np.datetime64 | np.timedelta64):
-        return kind, ("NaT" if np.isnat(value) else int(value.astype(np.int64)), np.datetime_data(value.dtype))
-    if isinstance(value, np.number | np.bool_ | np.character):
-        return kind, (value.item(),)
+        if isinstance(value, np.dtype):
+            return np.dtype, (value.str if value.names is None else value.descr,)
+        if isinstance(value, np.number | np.bool_):
+            return kind, (value.item(),)
     return None
 
 

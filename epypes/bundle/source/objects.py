@@ -22,7 +22,6 @@ import threading
 import types
 import warnings
 import weakref
-from abc import ABCMeta, _get_dump  # type: ignore[attr-defined]
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -240,30 +239,18 @@ def _class(kind: type) -> Description:
     parts: list[tuple[str, Any]] = [(" metaclass", type(kind)), (" bases", kind.__bases__), *_annotations(kind)]
     if isinstance(kind.__doc__, str):  # a class of C code may have a descriptor for it
         parts.append((f"{ANNOTATION}its docstring", kind.__doc__))
-    if registered := registered_classes(kind):
-        parts.append((" registered classes", registered))
     if "__dataclass_params__" in vars(kind):
         parts.append((" options", repr(vars(kind)["__dataclass_params__"])))
     if isinstance(kind, enum.EnumMeta):
         members: Mapping[str, Any] = kind.__members__
         left_out |= {*members, *_OF_ENUMS}
         parts += ((f" member {name!r}", member) for name, member in members.items())
-        known = [(value, one) for value, one in kind._value2member_map_.items() if one.name in members]
-        named = {id(one) for value, one in known if value == one.value}
-        added = {value: one.name for value, one in known if value != one.value and id(one) in named}
-        parts.append((" further values", added))
     slots = types.MemberDescriptorType, types.GetSetDescriptorType
     own = {name: value for name, value in vars(kind).items() if name not in left_out and not isinstance(value, slots)}
     # What the user has named comes first in a reason.
     names = sorted(own, key=lambda name: (name.startswith("__"), name))
     parts += ((f" {name!r}", own[name]) for name in names)
     return Description("class", (kind.__name__,), parts, module=kind.__module__)
-
-
-def registered_classes(kind: type) -> list[type]:
-    """Return the classes that count as subclasses of an abstract one by its ``register``."""
-    found = _get_dump(kind)[0] if isinstance(kind, ABCMeta) else ()
-    return sorted(filter(None, (one() for one in found)), key=lambda one: one.__qualname__)
 
 
 # -- graphs ----------------------------------------------------------------------------------------------------------
@@ -373,28 +360,19 @@ def _library_object(value: Any) -> Description:
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]
     parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _without_computed(kind, state))]
     parts += [(" items", [*(items or ())]), (" entries", [*(pairs or ())])]
-    if "_hardmask" in (hidden := getattr(value, "__dict__", {})):  # of a masked array, which pickle leaves out
-        parts.append((" hard mask", hidden["_hardmask"]))
     # A method of an object is no state, but the object is.
     is_state = not isinstance(value, types.BuiltinFunctionType)
     return Description(kind.__name__, parts=parts, is_state=is_state, is_pickled=True)
 
 
 def _without_computed(kind: type, state: Any) -> Any:
-    """Return a state without what is computed from the rest when it is first needed, and without addresses."""
-    if type(state) is tuple and any(base.__name__ == "cKDTree" for base in kind.__mro__):
-        return state[1:]  # the nodes, which are in the order of the indices that follow, point to each other
+    """Return a state without what is computed from the rest when it is first needed."""
     if type(state) is tuple and len(state) == 2 and type(state[0]) is dict:
         return _without_computed(kind, state[0]), state[1]
     computed = {*cached_properties(kind), *({"_ufunc"} if (kind.__module__, kind.__name__) == _VECTORIZE else ())}
     return (
         {name: state[name] for name in sorted(state, key=str) if name not in computed} if type(state) is dict else state
     )
-
-
-def is_unset(value: Any) -> bool:
-    """Whether this is what a private attribute begins with that a library computes when it is first asked."""
-    return value is None or value is False
 
 
 _VECTORIZE: Final = ("numpy", "vectorize")
@@ -417,9 +395,9 @@ def describe_message(value: Any) -> Description:
 # -- modules ---------------------------------------------------------------------------------------------------------
 
 
-def is_installed(module: str | None) -> bool:
-    """Whether a module is of an installed package, of Python's library or of EPypes; code in no module is not."""
-    return module is not None and module != "__main__" and not is_own(module.partition(".")[0])
+def is_installed(module: str) -> bool:
+    """Whether a module is of an installed package, of Python's library or of EPypes."""
+    return module != "__main__" and not is_own(module.partition(".")[0])
 
 
 def will_be_installed(module: str) -> bool:
@@ -445,8 +423,8 @@ def module_reads(function: types.FunctionType) -> list[tuple[str, Any]]:
         name, value = waiting.pop()
         if isinstance(value, types.ModuleType) and value.__name__ not in seen and not is_installed(value.__name__):
             seen.add(value.__name__)
-            own = {one: part for one, part in vars(value).items() if not one.startswith("__") or one == "__getattr__"}
-            read = own.keys() if ATTRIBUTES_BY_TEXT & used else (used | {"__getattr__"}) & own.keys()
+            own = {one: part for one, part in vars(value).items() if not one.startswith("__")}
+            read = own.keys() if ATTRIBUTES_BY_TEXT & used else used & own.keys()
             new = [(f"{name}.{one}", own[one]) for one in sorted(read)]
             found += new
             waiting += new

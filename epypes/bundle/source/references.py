@@ -15,12 +15,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Final
 
-from epypes.bundle.private_import import loaded_module, name_meant
+from epypes.bundle.private_import import name_meant
 
 # A class reads the name of the module around it, whichever that is, and has its own annotations.
 _OF_EVERY_CLASS: Final = frozenset({"__name__", "__annotations__"})
 _LOADS_CONSTANT: Final = frozenset({"LOAD_CONST", "LOAD_SMALL_INT"})
-_LOADS_NAME: Final = frozenset({"LOAD_GLOBAL", "LOAD_NAME", "LOAD_DEREF"})
 _MODELS_OF_CV2: Final = frozenset({"BackgroundSubtractor", "KalmanFilter", "Tracker", "VideoCapture", "VideoWriter"})
 
 
@@ -133,28 +132,6 @@ def defaults_of(function: types.FunctionType) -> dict[str, Any]:
     given, code = function.__defaults__ or (), function.__code__
     names = code.co_varnames[: code.co_argcount]
     return dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
-
-
-def attributes_loaded(function: types.FunctionType) -> Iterator[Any]:
-    """Give what a function loads as attributes of modules, such as ``np.random.rand``, also if it imports them."""
-    for code in nested_codes(function.__code__):
-        known, module, value = meanings_of(function, code.co_names + code.co_freevars), None, None
-        for step in dis.get_instructions(code):
-            operation, name = step.opname, step.argval
-            if operation == "IMPORT_NAME":
-                module = value = loaded_module(name)
-            elif operation == "IMPORT_FROM":
-                value = getattr(module, name, None)
-                yield value
-            elif operation == "STORE_FAST":
-                known[name] = value
-            elif operation.startswith("LOAD_FAST") or operation in _LOADS_NAME:
-                value = known.get(name) if isinstance(name, str) else None
-            elif operation in ("LOAD_ATTR", "LOAD_METHOD"):
-                value = getattr(value, name, None) if isinstance(value, types.ModuleType) else None
-                yield value
-            elif operation not in ("PUSH_NULL", "CACHE", "NOP"):
-                value = None
 
 
 def is_model_of_cv2(value: Any) -> bool:

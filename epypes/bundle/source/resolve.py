@@ -123,14 +123,11 @@ def _reached(module: str, qualname: str) -> Any:
 
 
 def evaluated(expression: ast.expr, names: Mapping[str, Any]) -> Any:
-    """Look up a dotted name; None for any other expression, and for what a property would compute."""
+    """Look up a dotted name; None for any other expression."""
     if isinstance(expression, ast.Name):
         return names.get(expression.id)
     if isinstance(expression, ast.Attribute):
-        owner, name = evaluated(expression.value, names), expression.attr
-        if isinstance(getattr(type(owner), name, None), property | functools.cached_property):
-            return getattr(owner, "__dict__", {}).get(name)
-        return getattr(owner, name, None)
+        return getattr(evaluated(expression.value, names), expression.attr, None)
     return None
 
 

@@ -9,12 +9,7 @@ from __future__ import annotations
 import ast
 import builtins
 import inspect
-import marshal
-import os
-import pickle
-import re
 import sys
-import traceback
 import types
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,7 +17,6 @@ from functools import lru_cache
 from typing import Any, Final
 
 from epypes.bundle.private_import import loaded_module
-from epypes.bundle.proof.process_settings import SETTINGS
 from epypes.bundle.source.references import global_names, module_of_import, namespace_of
 from epypes.bundle.source.resolve import (
     Definition,
@@ -159,46 +153,10 @@ def check_notebook_name(name: str, found: Definition) -> None:
 
 
 # By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
-_REFLECTING: Final = (
-    *(builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack),
-    *(inspect.getfile, inspect.getmodule, inspect.getsource, inspect.getsourcefile, inspect.getsourcelines),
-)
+_REFLECTING: Final = (builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack)
 _REFLECTING_ATTRIBUTES: Final = frozenset(
-    {"__globals__", "__builtins__", "__subclasses__", "f_globals", "f_locals", "f_builtins", "f_back", "f_lineno"}
-    | {"cache_info", "tb_lineno", "co_filename", "co_firstlineno", "__firstlineno__", "co_name", "co_qualname"}
+    {"__globals__", "__builtins__", "f_globals", "f_locals", "f_builtins", "f_back"}
 )
-
-# What these make says where a bundle's text stands, how Python keeps equal objects, or of which module a class is.
-_OF_THE_PLACE: Final = (
-    *(traceback.format_exc, traceback.format_exception, traceback.format_tb, traceback.format_stack),
-    *(traceback.extract_tb, traceback.extract_stack, traceback.TracebackException),
-    *(pickle.dump, pickle.dumps, pickle.Pickler, marshal.dump, marshal.dumps, sys.getsizeof, sys.getrefcount),
-)
-
-
-def _check_places(found: Definition, names: Mapping[str, Any]) -> None:
-    """Refuse a definition whose result depends on where its text, or an object, is."""
-    for node in ast.walk(found.node):
-        for read in (node, *_attribute_of(node, "getattr")):
-            value = evaluated(read, names) if isinstance(read, ast.Name | ast.Attribute) else None
-            if any(value is one for one in _OF_THE_PLACE):
-                text = f"{found.what} uses {ast.unparse(read)!r} ({found.place_in(node)}), whose result depends on"
-                text = f"{text} lines of the notebook, or on where objects are in memory, which a bundle has otherwise"
-                raise Refused(f"{text}. Leave it out, or take what it is made of.")
-        if not isinstance(node, ast.Compare) or not any(isinstance(one, ast.Is | ast.IsNot) for one in node.ops):
-            continue
-        for side in (node.left, *node.comparators):
-            if _is_made_again(evaluated(side, names)):
-                text = f"{found.what} compares {ast.unparse(node)!r} ({found.place_in(node)}) by 'is': equal numbers"
-                raise Refused(f"{text} and texts may be one object in a bundle and several in a notebook. Write '=='.")
-
-
-def _is_made_again(value: Any) -> bool:
-    """Whether Python may have several objects that equal this number or text; NaN is found by its identity."""
-    if type(value) is int:
-        return not -5 <= value <= 256
-    is_text = type(value) in (str, bytes) and len(value) > 1
-    return is_text or (type(value) in (float, complex) and value == value)
 
 
 def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
@@ -213,54 +171,6 @@ def _check_reflection(found: Definition, names: Mapping[str, Any]) -> None:
                 raise Refused(f"{text} what no name in it says. Use what you need by its name, or make it a token.")
 
 
-# Functions of Python's library that set something for the whole process are called like this, but for those that
-# begin in the same way; functions of other libraries that do.
-_SETTER: Final = re.compile(r"(un)?register|set(?!$|attr|item|_blocking)|disable|enable|umask$|tzset$")
-_SETTERS: Final = (
-    *(("cv2.ocl", "setUseOpenCL"), ("cv2.ipp", "setUseIPP"), ("numpy", "setbufsize"), ("numpy", "seterrcall")),
-    *(("scipy.fft", "set_global_backend"), ("sklearn", "set_config")),
-)
-
-
-def _sets_process(value: Any) -> bool:
-    """Whether a function sets for the whole process what the comparison of its settings doesn't read."""
-    if not isinstance(value, types.FunctionType | types.BuiltinFunctionType | types.MethodType):
-        return False
-    home, name = str(value.__module__).lstrip("_"), value.__name__
-    owner = getattr(value, "__self__", None)
-    is_plain = owner is None or isinstance(owner, types.ModuleType) or name == "register"
-    is_of_python = home.partition(".")[0] in sys.stdlib_module_names and home not in {one.module for one in SETTINGS}
-    is_setter = is_of_python and is_plain and _SETTER.match(name) is not None
-    return is_setter or any(value is getattr(sys.modules.get(home), name, None) for home, name in _SETTERS)
-
-
-def _check_setters(found: Definition, names: Mapping[str, Any]) -> None:
-    """Refuse a definition that calls a function which sets something for the whole process."""
-    # What decorators register is there when the module has been imported.
-    for node in ast.walk(ast.Module([*found.node.body], [])):
-        for read in (node, *_attribute_of(node, "getattr")):
-            if isinstance(read, ast.Name | ast.Attribute) and _sets_process(evaluated(read, names)):
-                raise _setter(found.what, f"{ast.unparse(read)!r} ({found.place_in(node)})")
-
-
-def _check_mocks(found: Definition, names: Mapping[str, Any]) -> None:
-    """Refuse a definition that patches by ``unittest.mock`` but in a 'with' statement, which undoes it."""
-    parts = [*ast.walk(ast.Module([*found.node.body], []))]
-    calls = [item.context_expr for part in parts if isinstance(part, ast.With) for item in part.items]
-    undone = {id(part) for call in calls if isinstance(call, ast.Call) for part in ast.walk(call.func)}
-    for node in parts:
-        value = evaluated(node, names) if isinstance(node, ast.Name | ast.Attribute) else None
-        is_patch = getattr(value, "__module__", "") == "unittest.mock" and "patch" in getattr(value, "__name__", "")
-        if is_patch and id(node) not in undone:
-            text = f"{found.what} uses {ast.unparse(node)!r} ({found.place_in(node)}) outside of a 'with' statement"
-            raise Refused(f"{text}, so that later events may find it patched. Write: with {ast.unparse(node)}(...):")
-
-
-def _setter(what: str, name: str) -> Refused:
-    text = f"{what} uses {name}, which sets something for the whole process, for later events and other threads too"
-    return Refused(f"{text}. Do it in the notebook if no result depends on it, or leave it out.")
-
-
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
 
@@ -268,18 +178,12 @@ def check_reads(found: Definition, known: Patches) -> None:
     """Refuse a definition that reads by reflection, or what the notebook has changed in a library's module or class."""
     names = {**sys.modules, **found.names, **imported_by(found)}
     _check_reflection(found, names)
-    _check_places(found, names)
-    _check_setters(found, names)
-    _check_mocks(found, names)
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
     for node in ast.walk(found.node):
-        value = evaluated(node, names) if isinstance(node, ast.Name | ast.Attribute) else None
-        if (os, "environ") in known and (value is os.environ or value is os.getenv):
-            raise _patched(found.what, "os.environ", known[os, "environ"])
         if isinstance(node, ast.Name | ast.Attribute) and id(node) not in dotted:
-            owner, name, place = changed.get(id(value), (None, "", ""))
+            owner, name, place = changed.get(id(evaluated(node, names)), (None, "", ""))
             if owner is not None:
                 raise _patched(found.what, f"{owner.__name__}.{name}", place)
     of_classes = {name: (owner, name) for owner, name in known if isinstance(owner, type)}
@@ -295,8 +199,6 @@ def check_reads(found: Definition, known: Patches) -> None:
 def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
     """Refuse an object that can be imported only as the notebook has changed it."""
     name = qualname.partition(".")[0]
-    if _sets_process(getattr(loaded_module(module), name, None)):
-        raise _setter(what, repr(f"{module}.{qualname}"))
     place = _place_of_patch(known, loaded_module(module), name, "by a name that no text has")
     if place:
         raise _patched(what, f"{module}.{qualname}", place)
@@ -334,8 +236,7 @@ def _is_patched(owner: Any, name: str) -> bool:
     """Whether a module has a function, class or mock of the notebook, in whatever way that was put there."""
     value = vars(owner).get(name) if isinstance(owner, types.ModuleType) and owner.__name__ != "__main__" else None
     is_own = isinstance(value, types.FunctionType) and value.__globals__.get("__name__") == "__main__"
-    is_mocks = isinstance(owner, types.ModuleType) and owner.__name__ == "unittest.mock"
-    homes = () if is_mocks else (getattr(value, "__module__", ""), type(value).__module__)
+    homes = (getattr(value, "__module__", ""), type(value).__module__)
     return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
 
 
@@ -350,8 +251,6 @@ def patches_in(texts: Iterable[tuple[str, str]], names: Mapping[str, Any]) -> Pa
     for cell, text in texts:
         for written in _written_in(text):
             node = written
-            if evaluated(getattr(node, "value", node), names) is os.environ:
-                found[os, "environ"] = f"{cell}, line {written.lineno}"
             while isinstance(node, ast.Attribute | ast.Subscript):
                 owner = evaluated(node.value, names) if isinstance(node, ast.Attribute) else None
                 is_of_library = isinstance(owner, type) and owner.__module__ != "__main__"

@@ -299,19 +299,7 @@ class Slice:
         else:
             self._write(name, _text(found, name), found)
         self._unfinished.discard(name)
-        self._register_implementations(name, function, found)
         return name
-
-    def _register_implementations(self, name: str, function: Any, found: Definition) -> None:
-        """Write the calls that register the implementations of a function of ``functools.singledispatch``."""
-        registry, lines = getattr(function, "registry", None), []
-        for kind, made in registry.items() if isinstance(registry, types.MappingProxyType) else ():
-            if made is not function.__wrapped__:
-                what = f"The implementation of {found.what[0].lower()}{found.what[1:]} for {kind.__name__!r}"
-                written = self._argument(made, what, f"{name}_{kind.__name__}")
-                lines.append(f"{name}.register({expression(self, kind, what)}, {written})")
-        if lines:
-            self.define(f"{name}.register", "\n".join(lines), position=_position(found))
 
     def _write_closure(self, name: str, inner: str, given: Mapping[str, str], found: Definition) -> None:
         """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
