@@ -100,7 +100,7 @@ def test_what_was_put_before_an_event_failed_is_answered_with_the_failure_after_
 """
     with ready_worker(owning(body), tmp_path) as front:
         header, (first, failure) = front.run(text="bad")
-        assert (header["failure"]["function"], header["failure"]["message"]) == ("f_out", "too late")
+        assert (header["failure"]["function"], header["failure"]["message"]) == ("put", "too late")
         assert (first.parts["repeated"], failure.failure.message) == ("badbad", "too late")
         assert front.run(text="a")[1][0].parts["repeated"] == "aa"
 
@@ -136,7 +136,7 @@ def test_an_answer_that_cannot_be_sent_is_the_failure_of_its_event(owning, tmp_p
 """
     with ready_worker(owning(body), tmp_path) as front:
         header, _ = front.run(text="no")
-        assert header["failure"]["function"] == "f_out"
+        assert header["failure"]["function"] == "put"
         assert "not str. Let f_out return one of these" in header["failure"]["message"]
         assert front.run(text="ok")[0]["failure"] is None
 
@@ -245,7 +245,8 @@ def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(i
         assert largest - before < 120_000_000
         for _ in range(3):
             front.run(image=np.full((1, 1), 14, np.uint8))
-        assert largest - rss(process) > 60_000_000
+        # The allocator may keep as much as two of the largest blocks.
+        assert largest - rss(process) > 30_000_000
 
 
 def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(inverting, tmp_path):
