@@ -78,7 +78,7 @@ def test_numbers_follow_a_drag_with_their_picture_their_change_and_their_verdict
     assert panel.page.locator(AREA).get_attribute("data-verdict") == "passed"
     x, y = panel.grab("threshold")
     panel.page.evaluate(WATCH)
-    panel.page.mouse.move(x + 12, y, steps=12)  # nothing is committed while it is held
+    panel.page.mouse.move(x + 40, y, steps=20)  # nothing is committed while it is held
     panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).threshold > 115")
     panel.settle()
     for threshold, area, state in panel.page.evaluate("pairs"):
