@@ -64,7 +64,7 @@ from epypes.run.guard import is_plain_array
 
 _PYTHON: Final = Path(os.__file__).resolve().parent
 # What lies beside EPypes is of its own project.
-_BESIDE_EPYPES: Final = Path(__file__).resolve().parents[2]
+_BESIDE_EPYPES: Final = Path(__file__).resolve().parents[3]
 _OURS: Final = ("epypes", "epypes_widgets")
 _RESTART: Final = "Restart the kernel, or call importlib.reload() with it, and run the cells again"
 
