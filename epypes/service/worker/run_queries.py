@@ -190,9 +190,10 @@ def _values(completed: CompletedRun | None, query: Mapping[str, Any]) -> AnswerP
 
 
 def _figure(shown: Run | CompGraphRunner) -> Figure:
-    from epypes.display import show
+    from epypes.display import Figure, view
 
-    return show(shown)
+    # Without its run: see RunQueries._answer.
+    return Figure(view(shown))
 
 
 def _json_of(figure: Figure) -> bytes:
