@@ -192,7 +192,7 @@ def _values(completed: CompletedRun | None, query: Mapping[str, Any]) -> AnswerP
 def _figure(shown: Run | CompGraphRunner) -> Figure:
     from epypes.display import Figure, view
 
-    # Without its run: see RunQueries._answer.
+    # Without its run, which is large.
     return Figure(view(shown))
 
 
