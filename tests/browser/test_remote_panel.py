@@ -130,7 +130,7 @@ def panel(open_notebook: Notebook) -> PanelOnScreen:
 
 
 def test_a_drag_changes_what_the_service_answers(panel: PanelOnScreen, line: Line, state: Any) -> None:
-    start = panel.values["canny_lo"]
+    start = last = panel.values["canny_lo"]
     service = ep.connect(state.http, token=Path(state.access_key_file).read_text().strip())
     before = service.parameters().revision
     x, y = panel.grab("canny_lo")
@@ -138,8 +138,9 @@ def test_a_drag_changes_what_the_service_answers(panel: PanelOnScreen, line: Lin
         panel.page.mouse.move(x - 6 * step, y)
         panel.wait(
             "last => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).canny_lo < last",
-            panel.values["canny_lo"] if step > 1 else start,
+            last,
         )
+        last = panel.values["canny_lo"]
     panel.page.mouse.up()
     panel.settle()
     shown, there = panel.values, service.parameters()
