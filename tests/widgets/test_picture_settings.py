@@ -17,7 +17,7 @@ import epypes as ep
 from epypes.errors import SettingsError, UnknownName
 from epypes_widgets import Panel, tune
 from epypes_widgets.picture.picture_settings import PictureSettings, auto_limits
-from epypes_widgets.settings import load_pictures, save
+from epypes_widgets.settings import load, save
 from tests.widgets.frontend import FrontEnd
 
 
@@ -324,19 +324,19 @@ def test_limits_that_are_no_two_numbers_are_refused_with_their_place(tmp_path: P
     file = save(tmp_path / "edges", {"k": 3})
     file.write_text(f"{file.read_text()}\n[pictures.image]\nlimits = {limits}\n")
     with pytest.raises(SettingsError, match=r"\[pictures.image\]: limits can't be"):
-        load_pictures(file)
+        load(file, {"k": 3})
 
 
 def test_a_file_without_pictures_has_no_section(tmp_path: Path) -> None:
     assert "pictures" not in save(tmp_path / "plain", {"k": 3}, pictures={"image": PictureSettings()}).read_text()
-    assert load_pictures(tmp_path / "plain") == {}
+    assert load(tmp_path / "plain", {"k": 3}).pictures == {}
 
 
 def test_every_setting_in_a_file_that_is_none_is_named(tmp_path: Path) -> None:
     file = save(tmp_path / "broken", {"k": 3})
     file.write_text(file.read_text() + '[pictures]\na = 3\n[pictures.b]\nzoom = "far"\n[pictures.c]\nlimits = [3, 2]\n')
     with pytest.raises(SettingsError) as caught:
-        load_pictures(file)
+        load(file, {"k": 3})
     assert len(caught.value.reasons) == 3
     assert "[pictures.b]: zoom can't be 'far'" in caught.value.reasons[1]
 

@@ -28,7 +28,7 @@ class Flags(enum.IntFlag):
 
 
 def there_and_back(tmp_path: Path, values: dict[str, Any], present: dict[str, Any] | None = None) -> dict[str, Any]:
-    return load(save(tmp_path / "x", values), values if present is None else present)
+    return load(save(tmp_path / "x", values), values if present is None else present).values
 
 
 def refused(path: Path, present: dict[str, Any]) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ def test_a_file_can_be_read_and_edited_by_a_person(tmp_path: Path) -> None:
         'lo = {value = [1, 2], kind = "tuple"} # 0 to 255 gray levels',
     ]
     file.write_text(file.read_text().replace("side = 5", "side = 7"))
-    assert load(file, {"side": 5, "lo": (1, 2)}) == {"side": 7, "lo": (1, 2)}
+    assert load(file, {"side": 5, "lo": (1, 2)}).values == {"side": 7, "lo": (1, 2)}
 
 
 def test_the_file_of_a_panel_has_the_ranges_and_units_of_annotations(tmp_path: Path) -> None:
@@ -100,13 +100,17 @@ def test_a_hint_that_is_no_range_is_passed_over(tmp_path: Path) -> None:
 
 def test_a_number_in_the_file_becomes_the_kind_that_the_runner_has(tmp_path: Path) -> None:
     file = hand_written(tmp_path, "a = 7\nb = 2\nc = 0.1\nd = true")
-    back = load(file, {"a": np.uint8(1), "b": np.float32(1), "c": np.float32(0), "d": np.bool_(False)})
+    back = load(file, {"a": np.uint8(1), "b": np.float32(1), "c": np.float32(0), "d": np.bool_(False)}).values
     assert [type(value) for value in back.values()] == [np.uint8, np.float32, np.float32, np.bool_]
 
 
 def test_a_value_of_another_kind_than_the_runner_has_is_as_the_file_says(tmp_path: Path) -> None:
     file = hand_written(tmp_path, 'a = "text"\nb = [1, 2]\nc = {kind = "none"}')
-    assert load(file, {"a": np.uint8(1), "b": np.uint8(1), "c": np.uint8(1)}) == {"a": "text", "b": [1, 2], "c": None}
+    assert load(file, {"a": np.uint8(1), "b": np.uint8(1), "c": np.uint8(1)}).values == {
+        "a": "text",
+        "b": [1, 2],
+        "c": None,
+    }
 
 
 def test_a_number_that_the_kind_can_not_hold_is_refused(tmp_path: Path) -> None:
@@ -166,7 +170,7 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path, data: bytes) -> Non
 def test_a_file_with_a_mark_of_its_byte_order_is_read(tmp_path: Path) -> None:
     file = hand_written(tmp_path, "k = 2")
     file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
-    assert load(file, {"k": 1}) == {"k": 2}
+    assert load(file, {"k": 1}).values == {"k": 2}
 
 
 @pytest.mark.parametrize("name", ["", ".", "/", "~nobody-of-this-name/x", "a\0b", "x" * 300])
@@ -198,7 +202,7 @@ def test_a_save_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(SettingsError, match="No space left"):
         save(file, {"k": 2})
-    assert load(file, {"k": 0}) == {"k": 1}
+    assert load(file, {"k": 0}).values == {"k": 1}
     assert list(tmp_path.iterdir()) == [file]
 
 
@@ -207,7 +211,7 @@ def test_a_link_goes_on_naming_the_file(tmp_path: Path) -> None:
     (tmp_path / "current.toml").symlink_to("v1.toml")
     save(tmp_path / "current", {"k": 2})
     assert (tmp_path / "current.toml").is_symlink()
-    assert load(tmp_path / "v1", {"k": 0}) == {"k": 2}
+    assert load(tmp_path / "v1", {"k": 0}).values == {"k": 2}
 
 
 def test_only_our_files_are_listed_by_name(tmp_path: Path) -> None:
@@ -217,5 +221,5 @@ def test_only_our_files_are_listed_by_name(tmp_path: Path) -> None:
     (tmp_path / "broken.toml").write_text("= =")
     (tmp_path / "huge.toml").write_text('format = "epypes settings 1"\n[hyperparameters]\n' + "# \n" * 400_000)
     assert names(tmp_path) == ("a.v2", "b", "größe")
-    assert load(tmp_path / "a.v2", {"k": 0}) == {"k": 1}
+    assert load(tmp_path / "a.v2", {"k": 0}).values == {"k": 1}
     assert names(tmp_path / "none") == ()

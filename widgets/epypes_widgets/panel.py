@@ -317,13 +317,13 @@ class Panel(Displayed):
         ValueError
             A value is outside of its range.
         """
-        pictures, tiles, cg = settings.load_pictures(path), settings.load_tiles(path), self._runner.cg
-        self.set(**settings.load(path, {**self._runner.hyperparameters, **self.values}))
-        for token, each in pictures.items():
+        loaded, cg = settings.load(path, {**self._runner.hyperparameters, **self.values}), self._runner.cg
+        self.set(**loaded.values)
+        for token, each in loaded.pictures.items():
             if all(map(cg.has_token, filter(None, (token, each.over)))):
                 self.show_as(token, **each.content)
-        if tiles is not None:
-            self._tuning.look(tiles=tiles)
+        if loaded.tiles is not None:
+            self._tuning.look(tiles=loaded.tiles)
 
     def write_back(self, dry_run: bool = False, timeout_s: float = 60.0) -> WriteBack:
         """Write the values of the panel into the bundle of its service, when all that was set is set there.

@@ -8,6 +8,7 @@ import secrets
 import stat
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,8 +82,27 @@ def save(
     return file
 
 
-def load(path: str | Path, present: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values in a file, by hyperparameter; the caller checks whether a range allows them.
+@dataclass(frozen=True)
+class Settings:
+    """What a file has that a panel saved.
+
+    Attributes
+    ----------
+    values
+        By hyperparameter.
+    pictures
+        By token, how its picture is shown.
+    tiles
+        The tokens whose numbers were shown, each once; None if the file does not say.
+    """
+
+    values: dict[str, Any]
+    pictures: dict[str, PictureSettings]
+    tiles: tuple[str, ...] | None
+
+
+def load(path: str | Path, present: Mapping[str, Any]) -> Settings:
+    """Return what is in a file; the caller checks whether a range allows the values.
 
     Parameters
     ----------
@@ -99,42 +119,30 @@ def load(path: str | Path, present: Mapping[str, Any]) -> dict[str, Any]:
         does not fit.
     """
     file = _with_suffix(path)
+    document = _read(file)
     values: dict[str, Any] = {}
     reasons: list[str] = []
-    for token, entry in _entries(file).items():
+    for token, entry in _entries(file, document).items():
         try:
             if token not in present:
                 raise UnknownName("hyperparameter", token, present, f"that is in {file.name}")
             values[token] = _value(entry, token, present[token])
         except (UnknownName, ValueError) as error:
             reasons.append(str(error))
-    if reasons:
-        raise SettingsError(file, reasons[:_MAX_REASONS])
-    return values
-
-
-def load_pictures(path: str | Path) -> dict[str, PictureSettings]:
-    """Return how pictures are shown, by token, as a file has it; SettingsError with every reason why not."""
-    file = _with_suffix(path)
-    found, reasons = {}, []
-    sections = _read(file).get(_PICTURES, {})
+    pictures: dict[str, PictureSettings] = {}
+    sections = document.get(_PICTURES)
     for token, section in sections.items() if isinstance(sections, dict) else ():
         try:
-            found[token] = PictureSettings.of(section if isinstance(section, dict) else {"": section})
+            pictures[token] = PictureSettings.of(section if isinstance(section, dict) else {"": section})
         except ValueError as error:
             reasons.append(f"[{_PICTURES}.{token}]: {error}")
     if reasons:
         raise SettingsError(file, reasons[:_MAX_REASONS])
-    return found
-
-
-def load_tiles(path: str | Path) -> tuple[str, ...] | None:
-    """Return the tokens whose numbers were shown when a file was saved, each once; None if it does not say."""
-    panel = _read(_with_suffix(path)).get(_PANEL)
+    panel = document.get(_PANEL)
     tiles = panel.get("tiles") if isinstance(panel, dict) else None
-    return (
-        tuple(dict.fromkeys(filter(lambda token: isinstance(token, str), tiles))) if isinstance(tiles, list) else None
-    )
+    if isinstance(tiles, list):
+        return Settings(values, pictures, tuple(dict.fromkeys(token for token in tiles if isinstance(token, str))))
+    return Settings(values, pictures, None)
 
 
 def names(folder: str | Path) -> tuple[str, ...]:
@@ -158,7 +166,7 @@ def _with_suffix(path: str | Path) -> Path:
 
 def _is_ours(file: Path) -> bool:
     try:
-        _entries(file)
+        _entries(file, _read(file))
     except SettingsError:
         return False
     return True
@@ -250,8 +258,7 @@ def _read(file: Path) -> dict[str, Any]:
         raise SettingsError(file, [f"{file} can't be read: {error}."]) from error
 
 
-def _entries(file: Path) -> dict[str, Any]:
-    document = _read(file)
+def _entries(file: Path, document: Mapping[str, Any]) -> dict[str, Any]:
     entries = document.get(_SECTION)
     if document.get("format") != FORMAT or not isinstance(entries, dict):
         found_format = document.get("format", "no format")
