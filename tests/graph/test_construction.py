@@ -24,9 +24,9 @@ def test_ten_times_the_functions_cost_about_ten_times_as_much():
         given, best = chain(count), float("inf")
         gc.collect()
         for _ in range(7):
-            start = time.perf_counter()
+            start = time.thread_time()  # what other processes take does not count
             ep.CompGraph(*given)
-            best = min(best, time.perf_counter() - start)
+            best = min(best, time.thread_time() - start)
         return best / count
 
     # Where it is quadratic, ten times as much per function.
