@@ -94,10 +94,15 @@ def lines_of_code(path):
     return found
 
 
-def test_tutorials_hold_no_widgets_whose_script_would_be_an_older_one():
-    notebooks = [*(ROOT / "notebooks").glob("*.ipynb")]
+def test_a_tutorial_asks_one_question_in_at_most_20_cells_and_holds_no_widgets_whose_script_would_be_an_older_one():
+    notebooks = {path.name: json.loads(path.read_text()) for path in (ROOT / "notebooks").glob("*.ipynb")}
     assert notebooks
-    assert [path.name for path in notebooks if "widgets" in json.loads(path.read_text())["metadata"]] == []
+    for name, notebook in notebooks.items():
+        sources = ["".join(cell["source"]) for cell in notebook["cells"]]
+        assert len(sources) <= 20, name
+        assert sources[0].partition("\n")[0].endswith("?"), name
+        assert not any("# NBVAL" in source for source in sources), name  # cells have tags
+        assert "widgets" not in notebook["metadata"], name
 
 
 def test_errors_are_drawn_as_a_tree_that_is_true():
