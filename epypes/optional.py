@@ -22,6 +22,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "cv2": ("opencv-python-headless", "vision"),
     "dask": ("dask", "cluster"),
     "distributed": ("distributed", "cluster"),
+    "docstring_parser": ("docstring-parser", "widgets"),
     "fastapi": ("fastapi", "serve"),
     "google": ("protobuf", "serve"),
     "graphviz": ("graphviz", "graphviz"),
