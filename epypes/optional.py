@@ -34,6 +34,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "jupyterlab": ("jupyterlab", "notebook"),
     "matplotlib": ("matplotlib", "vision"),
     "mcap": ("mcap", "record"),
+    "mcap_protobuf": ("mcap-protobuf-support", "record"),
     "nats": ("nats-py", "nats"),
     "nbclient": ("nbclient", "service"),
     "nbformat": ("nbformat", "service"),

@@ -42,7 +42,7 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
         short text to count by.
     """
     views = _views(frames)
-    header = _read_header(views, "epypes.v1.Envelope", limits)
+    header = read_header(views, "epypes.v1.Envelope", limits)
     limits.check_names(header)
     reader = ValueReader(views[LEADING_FRAMES:], limits)
     try:
@@ -122,7 +122,7 @@ class EncodedEnvelope:
             The frame count, a size, the topic, the version or the header is not that of a v1 message.
         """
         views = _views(frames)
-        header = _read_header(views, "epypes.v1.Header", limits)
+        header = read_header(views, "epypes.v1.Header", limits)
         made = cls()
         made.frames, made.limits = tuple(views), limits
         made.failure = _read_failure(header.failure) if header.HasField("failure") else None
@@ -163,7 +163,7 @@ def _views(frames: Sequence[bytes | bytearray | memoryview]) -> list[memoryview]
         raise MessageError("bad frame", f"A frame must be contiguous bytes: {error}") from error
 
 
-def _read_header(views: Sequence[memoryview], kind: str, limits: Limits) -> Any:
+def read_header(views: Sequence[memoryview], kind: str, limits: Limits) -> Any:
     """Check the sizes, the topic and the version of a message; return its header, parsed as a message of a kind."""
     limits.check_frames(views)
     topic = bytes(views[0][: MAX_TOPIC_BYTES + 1])
