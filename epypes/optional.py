@@ -40,6 +40,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "nbformat": ("nbformat", "service"),
     "networkx": ("networkx", "widgets"),
     "numpy": ("numpy", "widgets"),
+    "opentelemetry": ("opentelemetry-api", "otel"),
     "optuna": ("optuna", "scale"),
     "paho": ("paho-mqtt", "mqtt"),
     "pandas": ("pandas", "scale"),

@@ -151,6 +151,17 @@ class EncodedEnvelope:
         """
         return decode(self.frames, self.limits)
 
+    def text_attributes(self) -> dict[str, str]:
+        """Return the attributes that are texts, by name; no other value is decoded.
+
+        Raises
+        ------
+        MessageError
+            The header is not that of a v1 message.
+        """
+        entries = read_header(self.frames, "epypes.v1.Envelope", self.limits).attributes
+        return {entry.name: entry.value.text for entry in entries if entry.value.WhichOneof("kind") == "text"}
+
     def __repr__(self) -> str:
         number = f" #{self.sequence}" if self.sequence else ""
         return f"<EncodedEnvelope {self.type[:20]!r}{number}: {sum(map(len, self.frames)):,} bytes>"
