@@ -15,8 +15,9 @@ from epypes.wire.arrays import read_image, read_tensor
 from epypes.wire.encoder import MAX_TOPIC_BYTES, REFUSALS, VERSION, encode
 from epypes.wire.envelope import SCALAR_FIELDS, Envelope, FailureRecord
 from epypes.wire.limits import DEFAULT_LIMITS, LEADING_FRAMES, Limits, Path, ValueCounter, format_path
-from epypes.wire.opencv_pandas import read_records, read_table
+from epypes.wire.opencv import read_records
 from epypes.wire.protobuf import message_class
+from epypes.wire.tables import read_arrow_table, read_table
 
 if TYPE_CHECKING:
     from epypes.images import Order
@@ -353,4 +354,5 @@ _READ: Final[dict[str, Callable[[ValueReader, Any, Path], Any]]] = {
     "tensor": read_tensor,
     "records": read_records,
     "table": read_table,
+    "arrow_table": read_arrow_table,
 }
