@@ -206,6 +206,8 @@ class OptimizeResult(BatchResult[Trial]):
             from epypes.display.paint.plot import ThemedFigure
         import optuna
 
+        # Loads the backend, which has Jupyter show pyplot's figures: that must outlast the style below.
+        pyplot.draw_if_interactive()
         with _quiet_optuna(), style.context("default"), pyplot.ioff():
             draw = getattr(optuna.visualization.matplotlib, name)
             axes = draw(self.study, target_name=cut_name(self.metric, 30), **options)

@@ -17,6 +17,8 @@ from urllib.parse import unquote
 
 import cv2
 import matplotlib
+import nbclient
+import nbformat
 import numpy as np
 import optuna
 import pytest
@@ -694,6 +696,20 @@ def test_figures_can_be_had_and_leave_pyplot_as_it_was(runner: ep.CompGraphRunne
     assert (pyplot.get_fignums(), dict(matplotlib.rcParams)) == ([], before)
     with pytest.raises(ScaleError, match="one value in all trials"):
         ep.optimize(runner_of(lambda x, k: 1.0, k=2), "y", [0], 4, ranges={"k": (0, 9)}).importance_plot()
+
+
+@pytest.mark.slow
+def test_in_a_notebook_a_figure_is_shown_once_and_those_of_pyplot_are_shown_after_it() -> None:
+    cells = [
+        "import epypes as ep\n"
+        "cg = ep.CompGraph({'f': lambda x, k: -abs(k - 4)}, {'f': (('x', 'k'), 'y')})\n"
+        "ep.optimize(ep.CompGraphRunner(cg, {'k': 9}), 'y', [0], 5, ranges={'k': (0, 9)}).history_plot()",
+        "from matplotlib import pyplot\npyplot.plot([1, 2])\nNone",
+    ]
+    notebook = nbformat.v4.new_notebook(cells=list(map(nbformat.v4.new_code_cell, cells)))
+    nbclient.NotebookClient(notebook, timeout=120).execute()
+    shown = [[each.output_type for each in cell.outputs if "data" in each] for cell in notebook.cells]
+    assert shown == [["execute_result"], ["display_data"]]
 
 
 @pytest.mark.slow
