@@ -43,7 +43,7 @@ class EventTracer:
 
     @classmethod
     def configured(cls, provider: TracerProvider | None) -> Self | None:
-        """Return the tracer of a provider, of that of this process without one; None if there is none."""
+        """Return the tracer of a provider, without one of that which is set for this process; None if none is set."""
         # A program that has set a provider has imported this module.
         api = sys.modules.get(_TRACE)
         if provider is None and api is not None:

@@ -57,19 +57,22 @@ def foxglove_images(frames: Sequence[bytes | memoryview], time_ns: int) -> Itera
     except MessageError:
         return
     seconds, nanoseconds = divmod(header.acquired_ns or time_ns, _SECOND_NS)
+    # A frame is one value: named by a thousand parts, it would be written as often.
+    free = set(range(LEADING_FRAMES, len(views)))
     for part in header.parts:
         kind = part.value.WhichOneof("kind")
         if kind not in {"image", "encoded"}:
             continue
         content = getattr(part.value, kind)
         frame = LEADING_FRAMES + content.frame if content.WhichOneof("storage") == "frame" else None
-        if frame is not None and frame >= len(views):
+        if frame is not None and frame not in free:
             continue
         data = memoryview(content.inline) if frame is None else views[frame]
         message = _raw_image(content, data) if kind == "image" else _compressed_image(data)
         if message is not None:
             message.timestamp.seconds, message.timestamp.nanos = seconds, nanoseconds
             message.frame_id, message.data = header.source, bytes(data)
+            free.discard(frame)
             yield FoxgloveImage(part.name, message, frame)
 
 

@@ -25,6 +25,7 @@ from epypes.transport import Player, Recorder, ZMQPublisher, ZMQSubscriber, make
 from epypes.transport.mcap import RecordingCounts, RecordingWriter, messages
 from epypes.wire import Envelope, JustBytes, decode, encode
 from epypes.wire.foxglove import foxglove_images
+from epypes.wire.protobuf import message_class
 from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -208,6 +209,14 @@ def test_a_file_of_images_that_is_no_recording_is_refused_and_a_missing_image_is
     with damaged.open("wb") as file:
         copy_without_images(tmp_path / "b.mcap", file)
     assert "an image of a message is missing" in read_until_error(damaged)[1]
+
+
+def test_a_frame_that_many_parts_name_is_one_image():
+    frames = encode(Envelope("a", {"left": IMAGE}))
+    message = message_class("epypes.v1.Envelope").FromString(frames[1])
+    for number in range(1_000):
+        message.parts.add(name=f"copy {number}").CopyFrom(message.parts[0])
+    assert len([*foxglove_images([frames[0], message.SerializeToString(), frames[2]], 1)]) == 1
 
 
 def copy_without_images(path, file) -> None:
