@@ -46,7 +46,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "pandas": ("pandas", "scale"),
     "prometheus_client": ("prometheus-client", "serve"),
     "psycopg": ("psycopg", "postgres"),
-    "pyarrow": ("pyarrow", "scale"),
+    "pyarrow": ("pyarrow", "tables"),
     "pydantic": ("pydantic", "serve"),
     "pydantic_core": ("pydantic-core", "serve"),
     "pygraphviz": ("pygraphviz", "graphviz"),

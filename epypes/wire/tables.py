@@ -45,7 +45,7 @@ def _pyarrow(path: Path) -> Any:
     try:
         import pyarrow
     except ImportError as error:
-        text = f"{format_path(path)} is a table, which travels by pyarrow: pip install 'epypes[scale]'."
+        text = f"{format_path(path)} is a table, which travels by pyarrow: pip install 'epypes[tables]'."
         raise MessageError("no pyarrow", text) from error
     return pyarrow
 

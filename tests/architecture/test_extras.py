@@ -97,6 +97,14 @@ if __name__ == "__main__":
     assert len(result.to_frame()) == 2
 """
 
+TABLES = """
+import pandas as pd
+from epypes.wire import Envelope, decode, encode
+
+table = pd.DataFrame({"name": ["a", None], "kind": pd.Categorical(["b", "b"])})
+assert decode(encode(Envelope("rows", {"table": table}))).parts["table"].equals(table)
+"""
+
 STORE = """
 import epypes as ep
 
@@ -318,6 +326,10 @@ def test_scale_maps_in_processes_checks_and_searches(environment):
     alone = environment("scale")
     alone.python(GRAPH + SCALE)
     assert alone.has("cv2", "fastapi", *JUPYTER) == []
+
+
+def test_tables_travel(environment):
+    environment("tables").python(TABLES)
 
 
 def test_cluster_maps_on_dask(environment):

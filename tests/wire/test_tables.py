@@ -212,7 +212,7 @@ def test_where_pandas_or_pyarrow_is_missing_the_error_says_so(monkeypatch):
     table = encode(Envelope("", {"v": FRAME}))
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for asked in (lambda: decode(table), lambda: encode(Envelope("", {"v": FRAME}))):
-        with pytest.raises(MessageError, match=r"pip install 'epypes\[scale\]'"):
+        with pytest.raises(MessageError, match=r"pip install 'epypes\[tables\]'"):
             asked()
     assert same(decode(former_frames(v=FORMER)).parts["v"], FORMER)
     monkeypatch.setitem(sys.modules, "pandas", None)
