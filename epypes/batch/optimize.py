@@ -207,7 +207,7 @@ class OptimizeResult(BatchResult[Trial]):
         import optuna
 
         # Loads the backend, which has Jupyter show pyplot's figures: that must outlast the style below.
-        pyplot.draw_if_interactive()
+        pyplot.draw_if_interactive()  # type: ignore[no-untyped-call]
         with _quiet_optuna(), style.context("default"), pyplot.ioff():
             draw = getattr(optuna.visualization.matplotlib, name)
             axes = draw(self.study, target_name=cut_name(self.metric, 30), **options)
