@@ -45,7 +45,7 @@ bench: $(VENV)/.bench
 # After a change in proto/: the messages, as epypes/wire/protobuf.py loads them.
 schema: $(VENV)/.test
 	$(BIN)/python -m grpc_tools.protoc -Iproto --include_imports --descriptor_set_out=epypes/wire/schema.binpb \
-		epypes2019/messages.proto epypes/v1/envelope.proto
+		epypes2019/messages.proto epypes/v1/envelope.proto foxglove/images.proto
 
 fix: $(VENV)/.test
 	$(BIN)/ruff check --fix .

@@ -9,7 +9,6 @@ database itself took 179 ms per trial.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import threading
 import warnings
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     import optuna
     import pandas as pd
 
-    from epypes.display.paint.plot import Plot
+    from epypes.display.paint.plot import ThemedFigure
     from epypes.store import Store
 
 # Of the values that are held between settings; further cases run from their files or arrays each time.
@@ -58,7 +57,6 @@ _NANOSECONDS: Final = "total_ns"
 _ABOUT: Final = "about"
 # On the page.
 _MOST_REASONS: Final = 3
-_PLOT_SIZE: Final = (6.4, 2.8)
 _MOST_DOTS: Final = 300
 
 
@@ -156,8 +154,7 @@ class OptimizeResult(BatchResult[Trial]):
         if len({trial.value for trial in completed}) < 2:
             return {}
         with _quiet_optuna():
-            evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-            return dict(optuna.importance.get_param_importances(self.study, evaluator=evaluator))
+            return dict(optuna.importance.get_param_importances(self.study, evaluator=_importance_evaluator()))
 
     def apply(self, runner: CompGraphRunner) -> None:
         """Set the best values on a runner."""
@@ -183,47 +180,41 @@ class OptimizeResult(BatchResult[Trial]):
             ("ms", [trial.total_ns / 1e6 for trial in trials], ""),
         ])  # fmt: skip
 
-    def history_plot(self) -> Plot:
-        """Draw the value of each trial that completed, and the best one so far."""
-        with optional_import("scale"):
-            from matplotlib import style
-            from matplotlib.ticker import MaxNLocator
-
-            from epypes.display.paint.plot import BLUE, PLOT_STYLE, RED, plot
-
-        best, choose = self.best_trial, max if self.direction == "maximize" else min
-        completed = [trial for trial in self.trials if trial.value is not None]
-        numbers, values = [trial.number for trial in completed], list(map(_value, completed))
-        with style.context(PLOT_STYLE):
-            figure, axes = plot(width=_PLOT_SIZE[0], height=_PLOT_SIZE[1])
-            dots = axes.scatter(numbers, values, s=14, color=BLUE, alpha=0.75, linewidths=0, label="a trial")
-            dots.set_rasterized(len(completed) > _MOST_DOTS)  # a picture of thousands is smaller
-            so_far = list(itertools.accumulate(values, choose))
-            axes.plot(numbers, so_far, color=RED, linewidth=1.6, drawstyle="steps-post", label="the best so far")
-            text = f"{cut_name(self.metric, 30)} by trial: from {values[0]:.6g} to {best.value:.6g}"
-            axes.set_title(text, loc="left", fontsize=9)
-            axes.set_xlabel("trial")
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-            figure.legend(loc="outside lower left", ncols=2, fontsize=9)
-        return figure
-
-    def importance_plot(self) -> Plot:
-        """Draw how much each hyperparameter matters, the most important at the top."""
-        with optional_import("scale"):
-            from matplotlib import style
-
-            from epypes.display.paint.plot import BLUE, PLOT_STYLE, plot
-
+    def history_plot(self) -> ThemedFigure:
+        """Return Optuna's figure of the value of each trial that completed, and of the best one so far."""
         _ = self.best_trial  # without one there is nothing to draw
-        parts = dict(reversed(self.importances.items()))
-        with style.context(PLOT_STYLE):
-            figure, axes = plot(width=_PLOT_SIZE[0], height=1.0 + 0.3 * len(parts))
-            bars = axes.barh([cut_name(token, 30) for token in parts], list(parts.values()), color=BLUE)
-            axes.bar_label(bars, [f"{part:.0%}" for part in parts.values()], padding=4)
-            axes.set_title(f"how much each matters for {cut_name(self.metric, 30)}", loc="left", fontsize=9)
-            axes.xaxis.set_visible(False)
-            axes.spines.bottom.set_visible(False)
-        return figure
+        return self._figure("plot_optimization_history")
+
+    def importance_plot(self) -> ThemedFigure:
+        """Return Optuna's figure of how much each hyperparameter matters.
+
+        Raises
+        ------
+        ScaleError
+            Fewer than two different values were found.
+        """
+        _ = self.best_trial  # without one there is nothing to draw
+        if not self.importances:
+            raise ScaleError("The metric had one value in all trials, so there are no importances to draw.")
+        return self._figure("plot_param_importances", evaluator=_importance_evaluator())
+
+    def _figure(self, name: str, **options: Any) -> ThemedFigure:
+        """Draw one of Optuna's figures. It opens a window of pyplot and sets a style for good: both are undone."""
+        with optional_import("scale"):
+            from matplotlib import pyplot, style
+
+            from epypes.display.paint.plot import ThemedFigure
+        import optuna
+
+        # Loads the backend, which has Jupyter show pyplot's figures: that must outlast the style below.
+        pyplot.draw_if_interactive()  # type: ignore[no-untyped-call]
+        with _quiet_optuna(), style.context("default"), pyplot.ioff():
+            draw = getattr(optuna.visualization.matplotlib, name)
+            axes = draw(self.study, target_name=cut_name(self.metric, 30), **options)
+            pyplot.close(axes.figure)
+        for dots in axes.collections:
+            dots.set_rasterized(len(self.trials) > _MOST_DOTS)  # a picture of thousands is smaller
+        return ThemedFigure(axes.figure)
 
     @property
     def _rows(self) -> tuple[Trial, ...]:
@@ -260,6 +251,13 @@ class OptimizeResult(BatchResult[Trial]):
             ("importance", ["", *(f"{parts[token]:.0%}" if token in parts else "" for token in tokens)]),
         ]
         return html_table("", columns)
+
+
+def _importance_evaluator() -> Any:
+    import optuna
+
+    with _quiet_optuna():
+        return optuna.importance.PedAnovaImportanceEvaluator()
 
 
 def best_of(trials: Sequence[Trial], direction: Direction) -> Trial | None:

@@ -39,9 +39,8 @@ _NAME: Final = "graph"
 _BUNDLE: Final = "the graph's bundle"
 _MOST_PACKAGES: Final = 16
 _NOTE: Final = (
-    "To be run by other processes or a cluster, a graph is promoted to a bundle first. "
-    "A ThreadPoolExecutor runs it as it is. If a function keeps something from one item to the next, "
-    "run it without an executor: on threads its results are others."
+    "Other processes run a graph as a bundle, never pickled: use a ThreadPoolExecutor, which runs it as it is, "
+    "or no executor if a function keeps something from one item to the next."
 )
 
 

@@ -78,8 +78,11 @@ def requirement_lines(modules: Collection[str]) -> tuple[str, ...]:
 
 
 def _requires(name: str) -> Iterator[str]:
-    """Give the names of the installed distributions that one requires, without those of its extras."""
-    for text in metadata.requires(name) or ():
+    """Give the names of the installed distributions that one requires, without those of its extras.
+
+    pandas computes texts by pyarrow where that is installed, and tables travel by it.
+    """
+    for text in (*(metadata.requires(name) or ()), *(["pyarrow"] if name == "pandas" else [])):
         with contextlib.suppress(InvalidRequirement, metadata.PackageNotFoundError):
             requirement = Requirement(text)
             if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):

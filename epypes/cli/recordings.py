@@ -37,7 +37,7 @@ def record(
 ) -> None:
     """Record published messages in a file.
 
-    The recording ends at SIGTERM or Ctrl+C, or after a time or number of messages.
+    The recording ends at SIGTERM or Ctrl+C, or after a time or number of messages. Foxglove shows its images.
     """
     from epypes.service.serving import SignalWait
     from epypes.transport import Recorder

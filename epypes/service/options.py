@@ -13,6 +13,8 @@ from epypes.service.event_states import StatePer
 from epypes.transport.address import Address, is_broker, parse_address
 
 if TYPE_CHECKING:
+    from opentelemetry.trace import TracerProvider
+
     from epypes.transport.zeromq.curve import Keys, PublicKey
 
 MailboxPolicy = Literal["latest", "drop_oldest", "fault"]
@@ -54,6 +56,8 @@ class Options:
         Of a bundle with state between events: ``"one"`` state for all events, or one for each ``"source"`` of them.
     partitioned
         Whether the broker delivers all events of one source to one replica, so that replicas may have state.
+    tracer_provider
+        Of OpenTelemetry: each event is a span of it; None for that which is set for this process, if there is one.
     """
 
     sub: str = ANY_PORT
@@ -72,6 +76,7 @@ class Options:
     replica: str = ""
     state_per: StatePer = "one"
     partitioned: bool = False
+    tracer_provider: TracerProvider | None = None
 
     @property
     def has_broker(self) -> bool:

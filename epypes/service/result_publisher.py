@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from epypes.service.failures.store import FailureStore
     from epypes.service.options import Options
     from epypes.service.supervision.frame_socket import WorkerMessage
+    from epypes.service.tracing import EventTracer
 
 Outcome = Literal["answered", "failed", "dead_letters"]
 FailureKind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]
@@ -307,6 +308,8 @@ class ResultPublisher:
         Where a row of each event is kept.
     provenance
         Returns what events are computed with now.
+    tracer
+        Makes the spans of events; None for none.
     """
 
     def __init__(
@@ -316,8 +319,9 @@ class ResultPublisher:
         store: FailureStore,
         event_log: EventLog,
         provenance: Callable[[], Provenance],
+        tracer: EventTracer | None,
     ) -> None:
-        self._answers, self._failures = answers, failures
+        self._answers, self._failures, self._tracer = answers, failures, tracer
         self._store, self._event_log, self._provenance = store, event_log, provenance
         self._listeners: list[Listener] = []
         self.latency = LatencyHistogram()
@@ -391,6 +395,8 @@ class ResultPublisher:
         return result
 
     def _report(self, event: AcceptedEvent, result: Result) -> None:
+        if self._tracer is not None:
+            self._tracer.trace(event, result, self._provenance())
         if result.failure is not None:
             self._event_log.keep(event, result, self._report_failure(event, result, result.failure))
             return

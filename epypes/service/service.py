@@ -28,6 +28,7 @@ from epypes.service.sd_notify import notify
 from epypes.service.state_file import ServiceState
 from epypes.service.supervision.supervisor import Supervisor
 from epypes.service.supervision.worker_queries import WorkerQueries
+from epypes.service.tracing import EventTracer
 from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
@@ -80,7 +81,8 @@ class Service:
         self.event_log = EventLog(given, bundle.settings.name, self._provenance)
         answers = AnswerOutput(given.pub, given, self._changed)
         failures = AnswerOutput(given.failures, given, self._changed)
-        self._results = ResultPublisher(answers, failures, self.failure_store, self.event_log, self._provenance)
+        tracer = EventTracer.configured(given.tracer_provider)
+        self._results = ResultPublisher(answers, failures, self.failure_store, self.event_log, self._provenance, tracer)
         self._dispatcher = Dispatcher(given, self._results, self._provenance)
         events = EventInput(given, self._dispatcher.accept, self._dispatcher.accept_exhausted, self._changed)
         self._endpoints = Endpoints(events, answers, failures)

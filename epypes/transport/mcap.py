@@ -4,6 +4,10 @@ Each multipart message is one MCAP message: its log time is the time of its arri
 topic, and its data are its frames as they arrived: their number (4 bytes), then the length (8 bytes) and the bytes of
 each, all little-endian. Frames are not decoded, so messages of 2019, of v1 and of other programs are kept alike.
 
+An image of a v1 message is an MCAP message of its own before it, in Foxglove's schema, on a channel called
+``TOPIC/PART``: so Foxglove and other programs show it. Its pixels are in the file once: the frame that they are has
+their place among the images in place of its length, with the highest bit set.
+
 A recorder that is killed leaves a file without an end, perhaps in the middle of a record: chunks are appended whole, a
 chunk that the disk took in part is cut off again, and a reader gives every whole message before it raises.
 """
@@ -14,7 +18,7 @@ import contextlib
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
@@ -22,8 +26,13 @@ from typing import Any, BinaryIO, Final, Self
 from epypes.errors import RecordingError
 from epypes.optional import optional_import
 from epypes.transport.channel import Frames
+from epypes.wire.foxglove import FoxgloveImage, foxglove_images, image_data
 
 _ENCODING: Final = "epypes-multipart"
+_IMAGE_ENCODING: Final = "protobuf"
+_IMAGE_SCHEMAS: Final = frozenset({"foxglove.RawImage", "foxglove.CompressedImage"})
+# Of a frame's length: the frame is the data of an image before the message.
+_IS_IMAGE: Final = 2**63
 # Names of the metadata records: one at the start, one at the end of a recording that was finished.
 _START, _COUNTS = "epypes.recording", "epypes.counts"
 _DROPPED: Final = "dropped: "
@@ -136,11 +145,14 @@ class RecordingWriter:
 
     def __init__(self, path: Path, about: Mapping[str, str], force: bool) -> None:
         with optional_import():
+            import mcap_protobuf.schema  # noqa: F401  said now if it is missing, not at the first image
             from mcap.writer import CompressionType, Writer
 
         self.path = path
         self.pending = self.written = self._bytes = 0
         self._channels: dict[str, int] = {}
+        self._image_channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
         self._file = _UnbufferedFile(path, force)
         # Only `flush` ends a chunk, so that it is known which messages are in the file.
         self._writer = Writer(self._file, chunk_size=2**62, compression=CompressionType.NONE)
@@ -151,10 +163,19 @@ class RecordingWriter:
     def append(self, time_ns: int, frames: Frames) -> None:
         """Append a message; it is in the file after the next `flush`, which this calls if much is pending."""
         self.pending += 1
-        data, number = _packed(frames), (self.written + self.pending) % 2**32
-        channel = self._channel(_topic_of(frames))
-        self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns, sequence=number)
-        self._bytes += len(data)
+        number, topic = (self.written + self.pending) % 2**32, _topic_of(frames)
+        records: list[tuple[int, bytes]] = []
+        places: dict[int, int] = {}
+        for image in foxglove_images(frames, time_ns):
+            channel = self._image_channel(topic, image)
+            if channel is not None:
+                if image.frame is not None:
+                    places[image.frame] = len(records)
+                records.append((channel, image.message.SerializeToString()))
+        records.append((self._channel(topic), _packed(frames, places)))
+        for channel, data in records:
+            self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns, sequence=number)
+            self._bytes += len(data)
         if self._bytes >= _CHUNK_BYTES:
             self.flush()
 
@@ -200,6 +221,19 @@ class RecordingWriter:
             self._channels[topic] = self._writer.register_channel(topic, _ENCODING, schema_id=0)
         return self._channels[topic]
 
+    def _image_channel(self, topic: str, image: FoxgloveImage) -> int | None:
+        """Return the channel of an image; None if there are too many already."""
+        from mcap_protobuf.schema import register_schema
+
+        schema = image.message.DESCRIPTOR.full_name
+        name = "/".join(filter(None, (topic, image.part)))[:_MAX_TOPIC_CHARACTERS]
+        if (name, schema) not in self._image_channels and len(self._image_channels) < _MAX_TOPICS:
+            if schema not in self._schemas:
+                self._schemas[schema] = register_schema(self._writer, type(image.message))
+            found = self._writer.register_channel(name, _IMAGE_ENCODING, schema_id=self._schemas[schema])
+            self._image_channels[name, schema] = found
+        return self._image_channels.get((name, schema))
+
 
 class _UnbufferedFile:
     """A new file without a buffer: a buffer would keep the bytes that the disk has refused, and try again."""
@@ -242,21 +276,35 @@ def _refused(path: Path, error: OSError) -> RecordingError:
     return RecordingError(path, f"{path} can't be written: {error.strerror or error}.")
 
 
-def _packed(frames: Frames) -> bytes:
+def _packed(frames: Frames, places: Mapping[int, int]) -> bytes:
+    """Return the data of an MCAP message; ``places`` has those of images, by the places of the frames that they are."""
     parts: list[bytes | memoryview] = [_NUMBER.pack(len(frames))]
-    for frame in frames:
-        parts += (_LENGTH.pack(len(frame)), frame)
+    for number, frame in enumerate(frames):
+        if number in places:
+            parts.append(_LENGTH.pack(_IS_IMAGE | places[number]))
+        else:
+            parts += (_LENGTH.pack(len(frame)), frame)
     return b"".join(parts)
 
 
-def _unpacked(data: bytes) -> list[memoryview]:
-    """Return the frames in the data of an MCAP message, without a copy; raise ValueError if these are none."""
+def _unpacked(data: bytes, images: Sequence[bytes]) -> list[memoryview]:
+    """Return the frames in the data of an MCAP message, without a copy; raise ValueError if these are none.
+
+    ``images`` has the data of the images before it.
+    """
     view = memoryview(data)
     count, place = int.from_bytes(view[: _NUMBER.size], "little"), _NUMBER.size
     frames = []
     for _ in range(count):
         start = place + _LENGTH.size
-        place = start + int.from_bytes(view[place:start], "little")
+        length = int.from_bytes(view[place:start], "little")
+        if length & _IS_IMAGE:
+            if length ^ _IS_IMAGE >= len(images):
+                raise ValueError("an image of a message is missing")
+            frames.append(memoryview(images[length ^ _IS_IMAGE]))
+            place = start
+            continue
+        place = start + length
         if place > len(view):
             raise ValueError("a frame is longer than its message")
         frames.append(view[start:place])
@@ -318,23 +366,24 @@ def _records(path: Path) -> Iterator[Any]:
     """Yield the messages as Recorded, and the metadata as records of the library."""
     with optional_import():
         from mcap.exceptions import InvalidMagic
-        from mcap.records import Channel, DataEnd, Message, Metadata
+        from mcap.records import Channel, DataEnd, Message, Metadata, Schema
         from mcap.stream_reader import StreamReader
 
-    topics: dict[int, str] = {}
+    reader = _MessageReader(path)
     try:
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size < _MAGIC_BYTES:
                 raise RecordingError(path, f"{path} is no MCAP file, or an empty one.")
             for record in StreamReader(_WholeReads(file), validate_crcs=True).records:
-                if isinstance(record, Channel):
-                    topics[record.id] = _recording_topic(record, path)
+                if isinstance(record, Schema | Channel):
+                    reader.declare(record)
                 elif isinstance(record, Message):
-                    yield Recorded(record.log_time, topics[record.channel_id], _unpacked(record.data))
+                    yield from reader.read(record)
                 elif isinstance(record, Metadata):
                     yield record
                 elif isinstance(record, DataEnd):
                     # The rest is an index, for readers that seek.
+                    reader.check()
                     return
     except RecordingError:
         raise
@@ -349,15 +398,50 @@ def _records(path: Path) -> Iterator[Any]:
         raise _damaged(path, error) from error
 
 
-def _recording_topic(channel: Any, path: Path) -> str:
-    topic: str = channel.topic
-    if channel.message_encoding != _ENCODING:
-        text = (
-            f"{path} is an MCAP file, but no recording of EPypes: its topic {topic[:80]!r} has messages of encoding "
-            f"{channel.message_encoding[:40]!r}. Play it with the program that wrote it."
-        )
-        raise RecordingError(path, text)
-    return topic
+class _MessageReader:
+    """Makes the records of messages and of their images what was recorded."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._schemas: dict[int, str] = {}
+        self._topics: dict[int, str] = {}
+        # The schema of each channel of images; and the images of one message, with its time and number.
+        self._image_schemas: dict[int, str] = {}
+        self._images: list[bytes] = []
+        self._images_of = (0, 0)
+
+    def declare(self, record: Any) -> None:
+        """Take the record of a schema or of a channel."""
+        if not hasattr(record, "schema_id"):
+            self._schemas[record.id] = record.name
+            return
+        schema = self._schemas.get(record.schema_id, "")
+        if record.message_encoding == _IMAGE_ENCODING and schema in _IMAGE_SCHEMAS:
+            self._image_schemas[record.id] = schema
+        elif record.message_encoding == _ENCODING:
+            self._topics[record.id] = record.topic
+        else:
+            raise _no_recording(self._path, record.topic, f"messages of encoding {record.message_encoding[:40]!r}")
+
+    def read(self, record: Any) -> Iterator[Recorded]:
+        """Yield the message of a record; keep an image for the message that follows it."""
+        if self._images_of != (record.log_time, record.sequence):
+            self._images, self._images_of = [], (record.log_time, record.sequence)
+        if record.channel_id in self._image_schemas:
+            self._images.append(image_data(self._image_schemas[record.channel_id], record.data))
+        else:
+            yield Recorded(record.log_time, self._topics[record.channel_id], _unpacked(record.data, self._images))
+
+    def check(self) -> None:
+        """Raise RecordingError if there are images, and no messages that they belong to."""
+        if self._image_schemas and not self._topics:
+            raise _no_recording(self._path, "", "images alone")
+
+
+def _no_recording(path: Path, topic: str, content: str) -> RecordingError:
+    where = f"its topic {topic[:80]!r}" if topic else "it"
+    text = f"{path} is an MCAP file, but no recording of EPypes: {where} has {content}."
+    return RecordingError(path, f"{text} Play it with the program that wrote it.")
 
 
 def _damaged(path: Path, error: Exception) -> RecordingError:

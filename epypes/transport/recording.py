@@ -102,6 +102,8 @@ class _FileThread:
 class Recorder(Startable):
     """Writes published messages into an MCAP file, each as it arrived, with the time of its arrival.
 
+    Foxglove shows the images of v1 messages in it, on topics called TOPIC/PART.
+
     Parameters
     ----------
     address

@@ -15,8 +15,9 @@ from epypes.wire.arrays import read_image, read_tensor
 from epypes.wire.encoder import MAX_TOPIC_BYTES, REFUSALS, VERSION, encode
 from epypes.wire.envelope import SCALAR_FIELDS, Envelope, FailureRecord
 from epypes.wire.limits import DEFAULT_LIMITS, LEADING_FRAMES, Limits, Path, ValueCounter, format_path
-from epypes.wire.opencv_pandas import read_records, read_table
+from epypes.wire.opencv import read_records
 from epypes.wire.protobuf import message_class
+from epypes.wire.tables import read_arrow_table, read_table
 
 if TYPE_CHECKING:
     from epypes.images import Order
@@ -42,7 +43,7 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
         short text to count by.
     """
     views = _views(frames)
-    header = _read_header(views, "epypes.v1.Envelope", limits)
+    header = read_header(views, "epypes.v1.Envelope", limits)
     limits.check_names(header)
     reader = ValueReader(views[LEADING_FRAMES:], limits)
     try:
@@ -122,7 +123,7 @@ class EncodedEnvelope:
             The frame count, a size, the topic, the version or the header is not that of a v1 message.
         """
         views = _views(frames)
-        header = _read_header(views, "epypes.v1.Header", limits)
+        header = read_header(views, "epypes.v1.Header", limits)
         made = cls()
         made.frames, made.limits = tuple(views), limits
         made.failure = _read_failure(header.failure) if header.HasField("failure") else None
@@ -151,6 +152,17 @@ class EncodedEnvelope:
         """
         return decode(self.frames, self.limits)
 
+    def text_attributes(self) -> dict[str, str]:
+        """Return the attributes that are texts, by name; no other value is decoded.
+
+        Raises
+        ------
+        MessageError
+            The header is not that of a v1 message.
+        """
+        entries = read_header(self.frames, "epypes.v1.Envelope", self.limits).attributes
+        return {entry.name: entry.value.text for entry in entries if entry.value.WhichOneof("kind") == "text"}
+
     def __repr__(self) -> str:
         number = f" #{self.sequence}" if self.sequence else ""
         return f"<EncodedEnvelope {self.type[:20]!r}{number}: {sum(map(len, self.frames)):,} bytes>"
@@ -163,7 +175,7 @@ def _views(frames: Sequence[bytes | bytearray | memoryview]) -> list[memoryview]
         raise MessageError("bad frame", f"A frame must be contiguous bytes: {error}") from error
 
 
-def _read_header(views: Sequence[memoryview], kind: str, limits: Limits) -> Any:
+def read_header(views: Sequence[memoryview], kind: str, limits: Limits) -> Any:
     """Check the sizes, the topic and the version of a message; return its header, parsed as a message of a kind."""
     limits.check_frames(views)
     topic = bytes(views[0][: MAX_TOPIC_BYTES + 1])
@@ -342,4 +354,5 @@ _READ: Final[dict[str, Callable[[ValueReader, Any, Path], Any]]] = {
     "tensor": read_tensor,
     "records": read_records,
     "table": read_table,
+    "arrow_table": read_arrow_table,
 }

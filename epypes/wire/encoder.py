@@ -14,8 +14,9 @@ from epypes.nothing import NothingType
 from epypes.wire.arrays import flat_bytes, write_array
 from epypes.wire.envelope import SCALAR_FIELDS, Envelope, FailureRecord
 from epypes.wire.limits import DEFAULT_LIMITS, Limits, Path, ValueCounter, format_path, no_codec
-from epypes.wire.opencv_pandas import are_records, is_table, write_records, write_table
+from epypes.wire.opencv import are_records, write_records
 from epypes.wire.protobuf import message_class
+from epypes.wire.tables import is_table, write_table
 
 if TYPE_CHECKING:
     from epypes.wire.arrays import AnyArray

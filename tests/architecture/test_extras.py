@@ -97,6 +97,14 @@ if __name__ == "__main__":
     assert len(result.to_frame()) == 2
 """
 
+TABLES = """
+import pandas as pd
+from epypes.wire import Envelope, decode, encode
+
+table = pd.DataFrame({"name": ["a", None], "kind": pd.Categorical(["b", "b"])})
+assert decode(encode(Envelope("rows", {"table": table}))).parts["table"].equals(table)
+"""
+
 STORE = """
 import epypes as ep
 
@@ -152,6 +160,23 @@ with ep.ZMQPublisher("tcp://127.0.0.1:*", messages) as publisher:
     recorder.wait(60)
     recorder.stop(60)
 print(recording_info("messages.mcap").messages)
+"""
+
+TRACED = """
+import os, subprocess, sys
+from epypes.service import call
+
+process = subprocess.Popen(
+    [os.path.join(os.path.dirname(sys.executable), "opentelemetry-instrument"), "--traces_exporter", "console",
+     "--metrics_exporter", "none", "--logs_exporter", "none", "epypes", "serve", "bundle"],
+    stdout=subprocess.PIPE, text=True, env={**os.environ, "PATH": os.path.dirname(sys.executable)},
+)
+try:
+    assert process.stdout.readline().startswith("READY")
+    call("bundle", {"image": image}, timeout_s=60)
+finally:
+    process.terminate()
+    print(process.communicate(timeout=60)[0])
 """
 
 BROKER = """
@@ -289,10 +314,22 @@ def test_record_records_and_tells_what_is_in_the_file(environment):
     assert "1 message" in done.stdout, done.stderr
 
 
+def test_otel_sets_a_tracer_provider_and_prints_the_spans_of_a_service(environment):
+    alone = environment("serve,otel")
+    printed = alone.python(GRAPH + "ep.promote(runner, 'bundle', outputs=['mask'])\n" + TRACED)
+    assert '"name": "process bundle"' in printed
+    assert '"name": "invert"' in printed
+    assert alone.has(*JUPYTER, "cv2") == []
+
+
 def test_scale_maps_in_processes_checks_and_searches(environment):
     alone = environment("scale")
     alone.python(GRAPH + SCALE)
     assert alone.has("cv2", "fastapi", *JUPYTER) == []
+
+
+def test_tables_travel(environment):
+    environment("tables").python(TABLES)
 
 
 def test_cluster_maps_on_dask(environment):

@@ -184,7 +184,10 @@ def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, pro
     runner = ep.CompGraphRunner(ep.CompGraph({"held": held}, {"held": ("image", "out")}))
     with pytest.raises(PromotionRefused, match="'held'") as refused:
         ep.map(runner, crops, processes)
-    assert "A ThreadPoolExecutor runs it as it is." in refused.value.__notes__[0]
+    assert refused.value.__notes__ == [
+        "Other processes run a graph as a bundle, never pickled: use a ThreadPoolExecutor, which runs it as it is, "
+        "or no executor if a function keeps something from one item to the next."
+    ]
 
 
 @pytest.mark.slow
@@ -203,7 +206,7 @@ def test_a_function_that_keeps_something_is_refused_with_the_way_out(crops, proc
     runner = ep.CompGraphRunner(ep.CompGraph({"apply": apply}, {"apply": ("image", "mask")}))
     with pytest.raises(PromotionRefused, match="is a method of an object of class") as refused:
         ep.map(runner, crops, processes)
-    assert "keeps something from one item to the next, run it without an executor" in refused.value.__notes__[0]
+    assert "no executor if a function keeps something from one item to the next" in refused.value.__notes__[0]
 
 
 @pytest.mark.slow

@@ -17,6 +17,8 @@ from urllib.parse import unquote
 
 import cv2
 import matplotlib
+import nbclient
+import nbformat
 import numpy as np
 import optuna
 import pytest
@@ -661,8 +663,8 @@ def test_it_shows_itself_as_a_plot_and_the_values_found() -> None:
     page = result._repr_mimebundle_()["text/html"]
     plot = plot_of(page)
     texts = ["".join(each.itertext()) for each in plot.iter("{http://www.w3.org/2000/svg}text")]
-    assert {"trial", "a trial", "the best so far", "0", "10"} <= set(texts)
-    dots = [each for each in plot.iter("{http://www.w3.org/2000/svg}use") if "fill-opacity" in each.get("style", "")]
+    assert {"Trial", "y", "Best Value", "0", "10"} <= set(texts)
+    dots = [each for each in plot.iter("{http://www.w3.org/2000/svg}use") if "--epypes-accent" in each.get("style", "")]
     assert len(dots) == 1 + 30 - len(result.failures), "and one in the legend"
     assert "--epypes-text" in page, "in the colours of the page"
     assert result.failures
@@ -673,7 +675,10 @@ def test_it_shows_itself_as_a_plot_and_the_values_found() -> None:
 def test_the_page_of_a_long_search_stays_small() -> None:
     trials = tuple(Trial(number, {"k": number}, None if number % 7 == 0 else number % 50) for number in range(5_000))
     axes = (ChoiceAxis("k", (0, 1), ("0", "1")),)
-    result = OptimizeResult(trials, "maximize", "metric", axes, optuna.create_study(direction="maximize"))
+    study = optuna.create_study(direction="maximize")
+    state = {True: optuna.trial.TrialState.FAIL, False: optuna.trial.TrialState.COMPLETE}
+    study.add_trials(optuna.trial.create_trial(state=state[each.has_failed], value=each.value) for each in trials)
+    result = OptimizeResult(trials, "maximize", "metric", axes, study)
     page = result._repr_mimebundle_()["text/html"]
     assert len(page) < 80_000
     assert plot_of(page).find(".//{http://www.w3.org/2000/svg}image") is not None, "thousands of dots are one picture"
@@ -683,11 +688,28 @@ def test_figures_can_be_had_and_leave_pyplot_as_it_was(runner: ep.CompGraphRunne
     result = ep.optimize(runner, "score", [0], 30)
     before = dict(matplotlib.rcParams)
     history, importance = result.history_plot(), result.importance_plot()
-    assert [value for _, value in history.axes[0].collections[0].get_offsets()] == [trial.value for trial in result]
-    assert max(history.axes[0].lines[0].get_ydata()) == result.best_value
-    assert [bar.get_width() for bar in importance.axes[0].patches] == list(result.importances.values())[::-1]
+    drawn, bars = history.figure.axes[0], importance.figure.axes[0].patches
+    assert [value for _, value in drawn.collections[0].get_offsets()] == [trial.value for trial in result]
+    assert max(drawn.lines[0].get_ydata()) == result.best_value
+    assert [bar.get_width() for bar in bars] == list(result.importances.values())[::-1]
     assert sum(result.importances.values()) == pytest.approx(1)
     assert (pyplot.get_fignums(), dict(matplotlib.rcParams)) == ([], before)
+    with pytest.raises(ScaleError, match="one value in all trials"):
+        ep.optimize(runner_of(lambda x, k: 1.0, k=2), "y", [0], 4, ranges={"k": (0, 9)}).importance_plot()
+
+
+@pytest.mark.slow
+def test_in_a_notebook_a_figure_is_shown_once_and_those_of_pyplot_are_shown_after_it() -> None:
+    cells = [
+        "import epypes as ep\n"
+        "cg = ep.CompGraph({'f': lambda x, k: -abs(k - 4)}, {'f': (('x', 'k'), 'y')})\n"
+        "ep.optimize(ep.CompGraphRunner(cg, {'k': 9}), 'y', [0], 5, ranges={'k': (0, 9)}).history_plot()",
+        "from matplotlib import pyplot\npyplot.plot([1, 2])\nNone",
+    ]
+    notebook = nbformat.v4.new_notebook(cells=list(map(nbformat.v4.new_code_cell, cells)))
+    nbclient.NotebookClient(notebook, timeout=120).execute()
+    shown = [[each.output_type for each in cell.outputs if "data" in each] for cell in notebook.cells]
+    assert shown == [["execute_result"], ["display_data"]]
 
 
 @pytest.mark.slow

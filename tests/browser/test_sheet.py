@@ -52,7 +52,7 @@ def test_the_plot_of_a_search_has_the_colours_of_the_page(browser: Any, kind: st
         assert paper == page.evaluate("getComputedStyle(document.body).backgroundColor"), "no frame is seen"
     assert unreadable(page, ".output") == []
     box = page.locator(".epypes-figure svg").bounding_box()
-    assert box["width"] / box["height"] == pytest.approx(6.4 / 2.8, rel=0.02)
+    assert box["width"] / box["height"] == pytest.approx(6.4 / 4.8, rel=0.02)
     page.context.close()
 
 

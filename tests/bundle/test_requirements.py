@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.requirements import fresh_environment, pins
+from epypes.bundle.requirements import fresh_environment, pins, requirement_lines
 from epypes.errors import BundleError
 from tests.bundle.test_slicer import notebook
 
@@ -46,6 +46,11 @@ def test_lazy_imports_are_captured_and_imports_of_the_notebook_or_of_epypes_are_
     assert not {"pandas", "matplotlib", "protobuf", "typer", "rich", "opencv-python-headless"} & set(found)
     assert found["numpy"] == np.__version__
     assert list(found) == sorted(found)
+
+
+def test_tables_need_pyarrow():
+    assert {"pandas", "pyarrow"} <= set(pins(requirement_lines({"pandas"})))
+    assert "pyarrow" not in pins(requirement_lines({"numpy"}))
 
 
 def distribution(folder, name, version, files=(), source=None):

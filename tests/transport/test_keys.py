@@ -101,6 +101,14 @@ def test_keys_are_files_that_zmq_auth_reads_and_the_secret_one_is_private(tmp_pa
     assert zmq.auth.load_certificate(public) == (made.public.encode(), None)
 
 
+def test_keys_in_another_layout_of_the_format_are_read(tmp_path):
+    public, secret = (key.decode() for key in zmq.curve_keypair())
+    text = f'#   ZeroMQ CURVE SECRET key\n\nmetadata\ncurve\n    public-key = "{public}"\n    secret-key = "{secret}"\n'
+    (tmp_path / "old.key_secret").write_text(text)
+    (tmp_path / "old.key_secret").chmod(0o600)
+    assert read_keys(tmp_path / "old") == Keys(public, secret)
+
+
 def test_keys_of_zmq_auth_are_read(tmp_path):
     public, secret = zmq.auth.create_certificates(tmp_path, "old")
     (tmp_path / "old.key_secret").chmod(0o600)
@@ -129,6 +137,7 @@ def test_keys_are_never_overwritten(tmp_path):
     with pytest.raises(KeysError, match="exists"):
         make_keys(tmp_path / "robot")
     assert read_keys(tmp_path / "robot") == made
+    assert {file.name for file in tmp_path.iterdir()} == {"robot.key", "robot.key_secret"}
 
 
 def test_a_bind_that_others_can_reach_needs_keys_or_to_be_called_insecure(tmp_path):

@@ -15,6 +15,7 @@ import time
 import weakref
 from collections import Counter
 
+import cv2
 import numpy as np
 import pytest
 import zmq
@@ -23,6 +24,8 @@ from epypes.errors import AddressError, RecordingError, StillRunning
 from epypes.transport import Player, Recorder, ZMQPublisher, ZMQSubscriber, make_keys, recording_info
 from epypes.transport.mcap import RecordingCounts, RecordingWriter, messages
 from epypes.wire import Envelope, JustBytes, decode, encode
+from epypes.wire.foxglove import foxglove_images
+from epypes.wire.protobuf import message_class
 from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -128,6 +131,107 @@ def test_any_reader_of_mcap_finds_topics_times_and_messages(tmp_path):
             "epypes.recording": {"address": "by hand"},
             "epypes.counts": {"received": "100", "written": "100"},
         }
+
+
+GREY, RED = IMAGE[:, :, 0].copy(), np.full((90, 120, 3), (0, 0, 255), np.uint8)
+PICTURES = [
+    (
+        "cam1",
+        Envelope("a", {"left": IMAGE, "n": 3, "right": GREY}, source="robot", acquired_ns=1_500_000_000_000_000_007),
+    ),
+    ("", Envelope("b", {"photo": RED}, rgb=["photo"])),
+    ("cam1", Envelope("c", {"left": IMAGE[::-1].copy(), "small": IMAGE[:4, :4], "deep": GREY.astype("<f4")})),
+    (
+        "cam1",
+        Envelope(
+            "d", {"file": cv2.imencode(".png", RED)[1].tobytes(), "big": cv2.imencode(".jpg", IMAGE)[1].tobytes()}
+        ),
+    ),
+    ("cam1", Envelope("e", {"wide": RED.astype("<u2"), "text": "none"})),
+]
+
+
+def test_images_are_shown_by_readers_of_foxglove_s_schemas_and_are_in_the_file_once(tmp_path):
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    sent = [
+        (number + 1, [bytes(frame) for frame in encode(each, topic)]) for number, (topic, each) in enumerate(PICTURES)
+    ]
+    written(tmp_path / "a.mcap", sent)
+    assert frames_of(tmp_path / "a.mcap") == [frames for _, frames in sent], "what is played is what was recorded"
+    whole = sum(len(frame) for _, frames in sent for frame in frames)
+    assert (tmp_path / "a.mcap").stat().st_size < whole + IMAGE.nbytes
+    assert recording_info(tmp_path / "a.mcap").topics == {"cam1": 4, "": 1}
+    found = []
+    with (tmp_path / "a.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            if channel.message_encoding == "protobuf":
+                image = DecoderFactory().decoder_for("protobuf", schema)(message.data)
+                found.append((message.log_time, channel.topic, schema.name, image))
+
+    def pixels(image):
+        if image.DESCRIPTOR.name == "CompressedImage":
+            return cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        flat = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+        return flat.reshape((image.height, image.width, 3) if image.encoding != "mono8" else flat.shape)
+
+    wanted = {
+        (1, "cam1/left", "foxglove.RawImage", "bgr8"): IMAGE,
+        (1, "cam1/right", "foxglove.RawImage", "mono8"): GREY,
+        (2, "photo", "foxglove.RawImage", "rgb8"): RED,
+        (3, "cam1/left", "foxglove.RawImage", "bgr8"): IMAGE[::-1],
+        (3, "cam1/small", "foxglove.RawImage", "bgr8"): IMAGE[:4, :4],
+        (4, "cam1/file", "foxglove.CompressedImage", "png"): RED,
+        (4, "cam1/big", "foxglove.CompressedImage", "jpeg"): cv2.imdecode(cv2.imencode(".jpg", IMAGE)[1], 1),
+    }
+    got = {(*each[:3], getattr(each[3], "encoding", "") or each[3].format): pixels(each[3]) for each in found}
+    assert got.keys() == wanted.keys()
+    for key, image in wanted.items():
+        assert np.array_equal(got[key], image), key
+    first = found[0][3]
+    assert (first.timestamp.ToNanoseconds(), first.frame_id) == (1_500_000_000_000_000_007, "robot")
+    assert found[2][3].timestamp.ToNanoseconds() == 2, "without a time of acquisition, that of its arrival"
+
+
+def test_a_file_of_images_that_is_no_recording_is_refused_and_a_missing_image_is_named(tmp_path):
+    from mcap_protobuf.writer import Writer
+
+    (image,) = foxglove_images(encode(Envelope("a", {"left": IMAGE})), 1)
+    with (tmp_path / "a.mcap").open("wb") as file, Writer(file) as writer:
+        writer.write_message("/camera", image.message)
+    assert read_until_error(tmp_path / "a.mcap")[1].endswith(
+        "is an MCAP file, but no recording of EPypes: it has images alone. Play it with the program that wrote it."
+    )
+    frames = [bytes(frame) for frame in encode(Envelope("a", {"left": IMAGE}), "cam")]
+    written(tmp_path / "b.mcap", [(1, frames)])
+    damaged = tmp_path / "c.mcap"
+    with damaged.open("wb") as file:
+        copy_without_images(tmp_path / "b.mcap", file)
+    assert "an image of a message is missing" in read_until_error(damaged)[1]
+
+
+def test_a_frame_that_many_parts_name_is_one_image():
+    frames = encode(Envelope("a", {"left": IMAGE}))
+    message = message_class("epypes.v1.Envelope").FromString(frames[1])
+    for number in range(1_000):
+        message.parts.add(name=f"copy {number}").CopyFrom(message.parts[0])
+    assert len([*foxglove_images([frames[0], message.SerializeToString(), frames[2]], 1)]) == 1
+
+
+def copy_without_images(path, file) -> None:
+    """Write what a filter of topics leaves of a recording."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    writer = Writer(file)
+    writer.start()
+    with path.open("rb") as source:
+        for _, channel, message in make_reader(source).iter_messages():
+            if channel.message_encoding != "protobuf":
+                number = writer.register_channel(channel.topic, channel.message_encoding, schema_id=0)
+                writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
+    writer.finish()
 
 
 def test_one_topic_can_be_recorded_alone(tmp_path):

@@ -56,6 +56,23 @@ def test_the_docstring_of_the_function_says_what_a_parameter_is() -> None:
     assert all_said("o") == "Blur the image."
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Blur.\n\nArgs:\n    x (int): the side\n        of it.\n\n        More.\n    y: Other.",
+        "Blur.\n\n:param x: the side\n    of it.\n:type x: int\n:param y: Other.",
+        "Blur.\n\n@param x: the side\n    of it.\n@param y: Other.",
+    ],
+    ids=["Google", "Sphinx", "Epydoc"],
+)
+def test_docstrings_of_other_styles_are_read(text: str) -> None:
+    def blur(image: Any, x: int) -> Any:
+        return image
+
+    blur.__doc__ = text
+    assert said(blur) == "The side of it."
+
+
 def test_the_hint_says_it_where_the_docstring_does_not() -> None:
     assert all_said("o", ep.Param(about="one of many", choices=("a", "b"))) == "One of many. One of 'a', 'b'."
     assert all_said("s", ep.Param(about="one of many")) == "Side of the window, in pixels."

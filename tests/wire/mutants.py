@@ -59,6 +59,10 @@ def mutate_description(frames: list[bytes], rng: random.Random) -> list[bytes]:
         records.rows.dtype = rng.choice(["<f8", "<f8", "<i8", "|u1"])
         if rng.random() < 0.5:
             records.rows.shape[:] = rng.choice([(30, 7), (0, 7), (7, 30), (2**61, 7), (), (210,)])
+    elif value.HasField("arrow_table"):
+        table = value.arrow_table
+        table.series, table.numbered = rng.random() < 0.3, rng.random() < 0.3
+        table.inline = mutate_bytes(table.inline, rng)
     elif value.HasField("table"):
         table = value.table
         column = rng.choice([table.index, table.columns, *table.data])

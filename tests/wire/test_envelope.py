@@ -13,13 +13,14 @@ import pytest
 from epypes.errors import MessageError
 from epypes.wire import Envelope, FailureRecord, Limits, decode, encode
 from epypes.wire.protobuf import message_class
+from tests.wire.former_tables import former_frames
 from tests.wire.mutants import mutate_description, mutate_frames
 
 
 def opencv_and_pandas():
     points = [cv2.KeyPoint(x, 2.5, 31, -1, 0.25, 1, -1) for x in range(30)]
     pairs = tuple((cv2.DMatch(n, 1, 0, 0.5), cv2.DMatch(n, 2, 0, 1.5)) for n in range(3))
-    columns = {"row": [1, 2], "word": ["a", None], "score": [0.5, float("nan")], "more": [(1,), None]}
+    columns = {"row": [1, 2], "word": ["a", None], "score": [0.5, float("nan")], "more": pd.Categorical(["x", None])}
     table = pd.DataFrame(columns, index=pd.to_datetime(["2019-01-01", "2019-01-02"]))
     return {"keypoints": points, "pairs": pairs, "keypoint": points[0], "table": table, "column": table["score"]}
 
@@ -255,11 +256,13 @@ def varint(number: int) -> bytes:
 def test_of_many_broken_messages_none_raises_anything_but_a_message_error(count):
     rng = random.Random(2019)
     frames = [bytes(frame) for frame in encode(full_envelope(), "cam1", inline_below=64)]
+    table = opencv_and_pandas()["table"].drop(columns="more")
+    former = former_frames(table=table, series=table["row"])
     reasons = []
     for number in range(count):
         mutation = mutate_description if number % 3 == 0 else mutate_frames
         try:
-            envelope = decode(mutation(frames, rng))
+            envelope = decode(mutation(former if number % 5 == 0 else frames, rng))
         except MessageError as error:
             reasons.append(error.reason)
         else:

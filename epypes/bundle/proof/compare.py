@@ -15,7 +15,8 @@ from typing import Any, Final
 
 from epypes.optional import optional_import
 from epypes.wire.encoder import set_sort_key
-from epypes.wire.opencv_pandas import FIELDS, is_table, record_fields, record_type, table_parts
+from epypes.wire.opencv import FIELDS, record_fields, record_type
+from epypes.wire.tables import is_table, table_parts
 from epypes.wording import counted
 
 # As Python and OpenCV write them; other text may hold numbers that look alike.

@@ -42,6 +42,13 @@ _THEMED: Final = {
     "#ffffff": "var(--epypes-paper,#ffffff)",
     BLUE: f"var(--epypes-accent,{BLUE})",
     RED: f"var(--epypes-warn,{RED})",
+    # Of figures in the style "ggplot", as Optuna's: the ground of the axes, their texts, edges, dots, lines and bars.
+    "#e5e5e5": "var(--epypes-grey,#e5e5e5)",
+    "#555555": "var(--epypes-quiet,#555555)",
+    "#cccccc": "var(--epypes-line,#cccccc)",
+    "#1f77b4": "var(--epypes-accent,#1f77b4)",
+    "#d62728": "var(--epypes-warn,#d62728)",
+    "#3182bd": "var(--epypes-accent,#3182bd)",
     r"(font-family:|font: (?:\w+ )*[\d.]+px) [^;\"]*": r"\1 var(--jp-ui-font-family,sans-serif)",
     r"(\.\d\d)\d+(?=[^<>]*>)": r"\1",
     r"\s*\n\s*": " ",
@@ -50,19 +57,28 @@ _THEMED: Final = {
 _PAPER: Final = "var(--jp-layout-color0,var(--vscode-editor-background,#ffffff))"
 
 
-class Plot(Figure):
-    """A figure of Matplotlib that shows itself in a notebook, whether pyplot has been imported or not."""
+class ThemedFigure:
+    """A figure of any library, as it shows itself in a notebook: in the colours of the page.
+
+    Attributes
+    ----------
+    figure
+        Of Matplotlib.
+    """
+
+    def __init__(self, figure: Figure) -> None:
+        self.figure = figure
 
     def savefig(self, fname: Any, **options: Any) -> None:
-        """Save the figure as Matplotlib does, in its own style."""
+        """Save the figure as Matplotlib does, in Matplotlib's own style."""
         with style.context(PLOT_STYLE):
-            super().savefig(fname, **options)
+            self.figure.savefig(fname, **options)
 
     @property
     def alt(self) -> str:
         """What is drawn, in words."""
-        titles = [axes.get_title(loc="left") for axes in self.axes]
-        return ". ".join(filter(None, (self.get_suptitle(), *titles)))
+        titles = [axes.get_title(loc=side) for axes in self.figure.axes for side in ("left", "center")]
+        return ". ".join(filter(None, (self.figure.get_suptitle(), *titles)))
 
     def html(self) -> str:
         """Return the figure as an element for ``paint_page``."""
@@ -72,7 +88,7 @@ class Plot(Figure):
         svg = BytesIO()
         # In a file letters are drawn. Here they stay text, which is smaller, and which screen readers read.
         with style.context([*PLOT_STYLE, {"svg.fonttype": "none"}]):
-            super().savefig(svg, format="svg", metadata={"Date": None})
+            self.figure.savefig(svg, format="svg", metadata={"Date": None})
         return svg.getvalue().decode()
 
     def _themed(self, svg: str) -> str:
@@ -84,8 +100,20 @@ class Plot(Figure):
         svg, png = self._svg(), BytesIO()
         # For what shows neither, such as a document made by LaTeX.
         self.savefig(png, format="png")
-        page = paint_page(self._themed(svg))
-        return {"text/plain": repr(self), "text/html": page, "image/svg+xml": svg, "image/png": png.getvalue()}
+        page, text = paint_page(self._themed(svg)), repr(self.figure)
+        return {"text/plain": text, "text/html": page, "image/svg+xml": svg, "image/png": png.getvalue()}
+
+
+class Plot(Figure):
+    """A figure of Matplotlib that shows itself in a notebook, whether pyplot has been imported or not."""
+
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Save the figure as Matplotlib does, in its own style."""
+        with style.context(PLOT_STYLE):
+            super().savefig(fname, **options)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        return ThemedFigure(self)._repr_mimebundle_(include, exclude)
 
 
 def plot(title: str = "", width: float = 8.0, height: float = 4.2) -> tuple[Plot, Axes]:

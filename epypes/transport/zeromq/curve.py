@@ -1,6 +1,6 @@
 """CURVE security of ZeroMQ sockets: key files, the peers that are allowed, and the options of a socket (RFC 26, 27).
 
-A pair of keys is two files, as ``zmq.auth`` writes them: ``NAME.key`` with the public key, which others may have, and
+A pair of keys is two certificates of ``zmq.auth``: ``NAME.key`` with the public key, which others may have, and
 ``NAME.key_secret`` with both, which only its owner can read.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import tempfile
 import uuid
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -65,17 +66,24 @@ def make_keys(path: str | Path) -> Keys:
     KeysError
         If one of the files exists already, or can't be written.
     """
-    public, secret = (key.decode() for key in zmq.curve_keypair())
+    from zmq.auth import create_certificates
+
     stem = _stem(Path(path))
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
-        _write(stem.with_name(f"{stem.name}.key_secret"), _text(public, secret), 0o600)
-        _write(stem.with_name(f"{stem.name}.key"), _text(public), 0o644)
+        # zmq.auth replaces files, and lets others read the secret key: so it writes into a folder of this user alone.
+        with tempfile.TemporaryDirectory(dir=stem.parent) as private:
+            public, secret = map(Path, create_certificates(private, stem.name))
+            secret.chmod(0o600)
+            for file in (secret, public):
+                place = stem.with_name(file.name)
+                place.touch(exist_ok=False)
+                file.replace(place)
     except FileExistsError as error:
         raise KeysError(error.filename, f"{error.filename} exists. Take another name, or move it away.") from error
     except OSError as error:
         raise KeysError(path, f"No keys can be written to {path}: {error.strerror}.") from error
-    return Keys(public, secret)
+    return read_keys(stem)
 
 
 def read_keys(path: str | Path) -> Keys:
@@ -240,19 +248,6 @@ class CurveOptions:
 
 def _stem(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in {".key", ".key_secret"} else path
-
-
-def _text(public: str, secret: str = "") -> str:
-    kind = "SECRET key: keep it on this machine" if secret else "public key: give it to the other machines"
-    more = f'    secret-key = "{secret}"\n' if secret else ""
-    return f'#   ZeroMQ CURVE {kind}\n\nmetadata\ncurve\n    public-key = "{public}"\n{more}'
-
-
-def _write(path: Path, text: str, mode: int) -> None:
-    # With its mode from the first moment; a chmod afterwards would come too late.
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(text)
 
 
 def _read(path: Path) -> Keys:

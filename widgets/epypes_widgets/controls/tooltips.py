@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterator
 from typing import Any, Final
 
+from docstring_parser import Docstring, ParseError, parse
+
 from epypes.graph import CompGraph, unwrapped
 from epypes.hints import Param
 from epypes_widgets.controls.ranges import Range, range_text, takers
@@ -14,7 +16,6 @@ from epypes_widgets.controls.ranges import Range, range_text, takers
 _MAX_CHARACTERS: Final = 300
 # Of a docstring: that of a class may be as long as a book.
 _MAX_READ: Final = 20_000
-_PARAMETERS: Final = re.compile(r"^Parameters\n-{3,}\n(.*?)(?=^\S[^\n]*\n-{3,}$|\Z)", re.MULTILINE | re.DOTALL)
 _SIGNATURE: Final = re.compile(r"^[\w.]+\(.*\)(\s*->.*)?$")
 
 
@@ -32,15 +33,14 @@ def tooltip(cg: CompGraph, token: str, param: Range) -> str:
 def _abouts(cg: CompGraph, token: str, param: Range) -> Iterator[str]:
     """Yield what there is: the parameter's text of each function, the hint's, the first line of each docstring."""
     known = [(taker.parameter, _docstring(taker.function)) for taker in takers(cg, token)]
-    for parameter, docstring in known:
-        section = _PARAMETERS.search(docstring)
+    for parameter, text in known:
         if parameter:
-            yield _sentence(_numpydoc(section[1], parameter) if section else _doxygen(docstring, parameter))
+            yield _sentence(_described(_parsed(text), parameter) or _doxygen(text, parameter))
     yield _sentence(_one_line(getattr(param, "about", "")))
-    for _, docstring in known:
-        first = docstring.strip().partition("\n")[0]
-        if not _SIGNATURE.match(first):
-            yield _one_line(first)
+    for _, text in known:
+        summary = _parsed(text).short_description or ""
+        if not _SIGNATURE.match(summary):
+            yield _one_line(summary)
 
 
 def _docstring(function: Any) -> str:
@@ -50,19 +50,21 @@ def _docstring(function: Any) -> str:
         return ""
 
 
-def _numpydoc(section: str, parameter: str) -> str:
+def _parsed(text: str) -> Docstring:
+    """Return a docstring of any style: NumPy's, Google's, Sphinx' or Epydoc's."""
+    try:
+        return parse(text)
+    except ParseError:
+        return Docstring()
+
+
+def _described(docstring: Docstring, parameter: str) -> str:
     """Return the first paragraph on a parameter; several may share one: ``low, high : float``."""
-    lines: list[str] = []
-    inside = False
-    for line in section.splitlines():
-        if line and not line[0].isspace():
-            names = {name.strip().lstrip("*") for name in line.partition(":")[0].split(",")}
-            inside = parameter in names
-        elif inside and (line.strip() or not lines):
-            lines.append(line)
-        elif inside:
-            break
-    return _one_line(" ".join(lines))
+    for item in docstring.params:
+        names = {name.strip().lstrip("*") for name in item.arg_name.split(",")}
+        if parameter in names and item.args[0] != "attribute":
+            return _one_line((item.description or "").partition("\n\n")[0])
+    return ""
 
 
 def _doxygen(docstring: str, parameter: str) -> str:

@@ -1,4 +1,4 @@
-"""Objects of OpenCV and tables of pandas come back as they were; what can't be one is refused."""
+"""Objects of OpenCV come back as they were; what can't be one is refused."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import sys
 
 import cv2
 import numpy as np
-import pandas as pd
 import pytest
 
 from epypes.errors import MessageError
@@ -79,57 +78,6 @@ def test_hundreds_of_keypoints_are_one_tensor_that_numpy_alone_can_open(tmp_path
         assert sample["inputs.points"][7, :2].tolist() == list(points[7].pt)
 
 
-FRAME = pd.DataFrame(
-    {
-        "count": [1, 2],
-        "word": ["a", None],
-        "score": [0.5, float("nan")],
-        "ok": [True, False],
-        "when": pd.to_datetime(["2019-01-01", None]),
-        "what": pd.Series([{"k": np.ones(2)}, None], dtype=object),
-        "small": np.array([1, 2], "u1"),
-    }
-)
-
-
-@pytest.mark.parametrize(
-    "table",
-    [
-        FRAME,
-        FRAME.set_index("word"),
-        FRAME.set_index("when")[["score"]],
-        FRAME.iloc[::-1],
-        FRAME.iloc[:0],
-        FRAME["word"],
-        FRAME["score"].rename(None),
-        pd.DataFrame(np.eye(3)),
-        pd.DataFrame(),
-        pd.DataFrame(index=["a", "b"]),
-        pd.DataFrame([[1, 2]], columns=["same", "same"]),
-        pd.DataFrame({(1, "a"): [1.0], None: ["x"]}),
-    ],
-)
-def test_tables_come_back_with_labels_and_types(table, tmp_path):
-    same = pd.testing.assert_frame_equal if table.ndim == 2 else pd.testing.assert_series_equal
-    for again in back(table, tmp_path):
-        same(again.drop(columns="what", errors="ignore"), table.drop(columns="what", errors="ignore"))
-        assert again.index.equals(table.index)
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        (pd.DataFrame({"kind": pd.Categorical(["a"])}), r"v\['kind'\] is a column of dtype category.*astype"),
-        (pd.Series([1], dtype="Int64"), "dtype Int64"),
-        (FRAME.set_index(["count", "word"]), r"reset_index\(\)"),
-    ],
-)
-def test_a_column_without_codec_is_named_with_a_way_out(table, words):
-    with pytest.raises(MessageError, match=words) as caught:
-        encode(Envelope("", {"v": table}))
-    assert caught.value.reason == "no codec"
-
-
 @pytest.mark.parametrize(
     ("value", "instead"),
     [
@@ -188,17 +136,6 @@ def test_more_objects_than_values_may_be_are_refused_before_one_is_made():
     assert caught.value.reason == "too many values"
 
 
-def test_tables_within_the_labels_of_tables_are_refused_beyond_the_depth():
-    message = message_class("epypes.v1.Envelope")()
-    value = message.parts.add(name="v").value
-    for _ in range(Limits().depth + 2):
-        value = value.table.index.values
-    value.none = True
-    with pytest.raises(MessageError) as caught:
-        decode([b"/", message.SerializeToString()])
-    assert caught.value.reason == "too deep"
-
-
 def test_a_set_with_an_item_twice_or_a_list_in_it_is_refused():
     for items in ([1, 1], [[]]):
         message = message_class("epypes.v1.Envelope")()
@@ -226,11 +163,8 @@ def test_the_bytes_of_a_set_do_not_depend_on_the_seed_of_hashes():
     assert len(outputs) == 1
 
 
-def test_what_is_read_where_opencv_or_pandas_is_missing_says_so(monkeypatch):
-    points, table = encode(Envelope("", {"v": [POINT]})), encode(Envelope("", {"v": FRAME}))
+def test_what_is_read_where_opencv_is_missing_says_so(monkeypatch):
+    points = encode(Envelope("", {"v": [POINT]}))
     monkeypatch.setitem(sys.modules, "cv2", None)
-    monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MessageError, match="pip install opencv-python-headless"):
         decode(points)
-    with pytest.raises(MessageError, match="pip install pandas"):
-        decode(table)
