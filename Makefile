@@ -13,7 +13,7 @@ PYTEST := $(BIN)/pytest -n $(PROCESSES) -p schemathesis.pytest.plugin -p nbval.p
 # Hundreds of interpreters are started by the tests: each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test soak test-matrix lab bench schema fix clean
+.PHONY: demo test soak test-matrix lab bench docs schema fix clean
 
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
@@ -42,6 +42,10 @@ lab: $(VENV)/.all
 bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks
 
+# The documentation site: docs/_build/html/index.html. Nothing is downloaded; warnings are errors.
+docs: $(VENV)/.test
+	$(BIN)/python -m sphinx --quiet --fresh-env --fail-on-warning --keep-going docs docs/_build/html
+
 # After a change in proto/: the messages, as epypes/wire/protobuf.py loads them.
 schema: $(VENV)/.test
 	$(BIN)/python -m grpc_tools.protoc -Iproto --include_imports --descriptor_set_out=epypes/wire/schema.binpb \
@@ -52,7 +56,7 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .matrix demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf $(VENV) .matrix docs/_build docs/reference/generated docs/tutorials demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.
 $(BIN)/python:
@@ -65,7 +69,7 @@ $(VENV)/.all: pyproject.toml | $(BIN)/python
 	touch $@
 
 $(VENV)/.test: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[all]' --group test
+	$(PIP) --editable '.[all]' --group test --group docs
 	touch $@ $(VENV)/.all
 
 $(VENV)/.bench: pyproject.toml | $(BIN)/python

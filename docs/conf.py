@@ -1,0 +1,86 @@
+"""Settings of the documentation site, which `make docs` builds into docs/_build/html without a network."""
+
+# Why Sphinx, myst-nb and the pydata theme: NumPy, pandas, SciPy and scikit-image have sites of this theme, so readers
+# know its search and its two colour themes. myst-nb shows the outputs that are saved in a notebook, without a kernel.
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import click
+from sphinx.application import Sphinx
+
+import epypes
+
+DOCS = Path(__file__).parent
+
+project = html_title = "EPypes"
+author = "The EPypes developers"
+copyright = author  # noqa: A001 - Sphinx reads this name
+version = release = epypes.__version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx_click",
+    "sphinx_copybutton",
+    "sphinx_design",
+]
+exclude_patterns = ["_build", "examples"]
+templates_path = ["_templates"]
+default_role = "code"
+
+toc_object_entries_show_parents = "hide"
+
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+# References to public names must be right. Signatures also have types of inner modules and other libraries.
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!epypes(_widgets|\.errors|\.wire)?\.[A-Za-z]\w*$).*")]
+# A class and a message may have one name: epypes.Image and epypes.wire.Image.
+suppress_warnings = ["ref.python"]
+
+# Literal blocks of docstrings are trees, tables and shell lines as well as Python.
+highlight_language = "none"
+
+myst_enable_extensions = ["colon_fence"]
+myst_heading_anchors = 3
+# Tutorials are shown with the outputs that are saved in them. A panel needs a kernel: its saved picture is shown.
+nb_execution_mode = "off"
+nb_merge_streams = True
+nb_mime_priority_overrides = [("html", "application/vnd.jupyter.widget-view+json", None)]
+
+html_theme = "pydata_sphinx_theme"
+html_theme_options = {
+    "navbar_align": "left",
+    "show_toc_level": 2,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+html_sidebars = {"index": [], "quickstart": [], "glossary": []}
+html_static_path = ["_static"]
+html_css_files = ["epypes.css"]
+html_copy_source = False
+
+# Sphinx reads what is below this folder, so the tutorials are copied into it.
+TUTORIALS = ("*.ipynb", "09_ros2_and_dds.md", "lanes.py", "test_lanes.py")
+(DOCS / "tutorials").mkdir(exist_ok=True)
+for pattern in TUTORIALS:
+    for path in (DOCS.parent / "notebooks").glob(pattern):
+        shutil.copy2(path, DOCS / "tutorials")
+
+
+def add_examples(app: Sphinx, ctx: click.Context, lines: list[str]) -> None:
+    """Write the examples of a command below its options."""
+    if examples := getattr(ctx.command, "examples", ()):
+        lines += [".. rubric:: Examples", "", ".. code-block:: sh", "", *(f"   {line}" for line in examples), ""]
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register what this file adds to Sphinx."""
+    app.connect("sphinx-click-process-epilog", add_examples)
+    return {"parallel_read_safe": True}
