@@ -47,7 +47,7 @@ suppress_warnings = ["ref.python"]
 # Literal blocks of docstrings are trees, tables and shell lines as well as Python.
 highlight_language = "none"
 
-myst_enable_extensions = ["colon_fence"]
+myst_enable_extensions = ["attrs_inline", "colon_fence"]
 myst_heading_anchors = 3
 # Tutorials are shown with the outputs that are saved in them. A panel needs a kernel: its saved picture is shown.
 nb_execution_mode = "off"

@@ -62,7 +62,7 @@ class Reader:
             if language == "python":
                 self._cell(text)
                 continue
-            for line in text.splitlines():
+            for line in text.replace("\\\n", "").splitlines():
                 for part in line.split(" && "):
                     self._line(part)
 
