@@ -13,7 +13,7 @@ PYTEST := $(BIN)/pytest -n $(PROCESSES) -p schemathesis.pytest.plugin -p nbval.p
 # Hundreds of interpreters are started by the tests: each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test soak test-matrix lab bench docs schema fix clean
+.PHONY: demo test soak test-matrix lab bench schema fix clean
 
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
@@ -43,6 +43,7 @@ bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks
 
 # The documentation site: docs/_build/html/index.html. Nothing is downloaded; warnings are errors.
+.PHONY: docs
 docs: $(VENV)/.test
 	$(BIN)/python -m sphinx --quiet --fresh-env --fail-on-warning --keep-going docs docs/_build/html
 
@@ -56,7 +57,8 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .matrix docs/_build docs/reference/generated docs/tutorials demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf $(VENV) .matrix demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf docs/_build docs/reference/generated docs/tutorials
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.
 $(BIN)/python:
