@@ -33,6 +33,8 @@ extensions = [
 exclude_patterns = ["_build", "examples"]
 templates_path = ["_templates"]
 default_role = "code"
+# Options keep their dashes: --out.
+smartquotes = False
 
 toc_object_entries_show_parents = "hide"
 
