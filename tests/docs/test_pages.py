@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import tomllib
 
 import cv2
 import nbformat
@@ -11,7 +13,7 @@ import pytest
 
 import epypes as ep
 from tests.brokers.nats import is_installed
-from tests.docs.pages import BROKER, DOCS, Reader, blocks
+from tests.docs.pages import BROKER, DOCS, ROOT, Reader, blocks
 from tests.service.processes import run_cli
 
 QUICKSTART = DOCS / "quickstart.md"
@@ -46,6 +48,13 @@ def test_the_quickstart_tunes_an_own_image(reader):
     gray = cv2.cvtColor(cv2.imread("photo.jpg"), cv2.COLOR_BGR2GRAY)
     expected = cv2.Canny(cv2.GaussianBlur(gray, (9, 9), 0), 40, 200)
     assert np.array_equal(cv2.imread("edges.png", cv2.IMREAD_GRAYSCALE), expected)
+
+
+def test_the_guide_on_installation_has_every_extra():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    cells = re.findall(r"^\| ([^|]+) \|", GUIDES["install"].read_text(encoding="utf-8"), re.MULTILINE)
+    named = re.findall(r"`(\w+)`", " ".join(cells))
+    assert sorted([*named, "all"]) == sorted(project["optional-dependencies"])
 
 
 @pytest.mark.slow
