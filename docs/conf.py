@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from docutils import nodes
 from sphinx.application import Sphinx
 
 import epypes
@@ -33,7 +34,7 @@ extensions = [
 exclude_patterns = ["_build", "examples"]
 templates_path = ["_templates"]
 default_role = "code"
-# Options keep their dashes: --out.
+# Options keep their dashes (--out), and lines of files their quotes.
 smartquotes = False
 
 toc_object_entries_show_parents = "hide"
@@ -82,7 +83,15 @@ def add_examples(app: Sphinx, ctx: click.Context, lines: list[str]) -> None:
         lines += [".. rubric:: Examples", "", ".. code-block:: sh", "", *(f"   {line}" for line in examples), ""]
 
 
+def write_dashes(app: Sphinx, doctree: nodes.document) -> None:
+    """Write a dash between a parameter and its description, as smartquotes would."""
+    for text in [*doctree.findall(nodes.Text)]:
+        if text == " -- ":
+            text.parent.replace(text, nodes.Text(" \N{EN DASH} "))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register what this file adds to Sphinx."""
+    app.connect("doctree-read", write_dashes)
     app.connect("sphinx-click-process-epilog", add_examples)
     return {"parallel_read_safe": True}
