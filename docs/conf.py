@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -69,12 +70,20 @@ html_static_path = ["_static"]
 html_css_files = ["epypes.css"]
 html_copy_source = False
 
+# What an earlier build has written below this folder, perhaps of files and names that are gone.
+for folder in ("tutorials", "reference/generated"):
+    shutil.rmtree(DOCS / folder, ignore_errors=True)
+
 # Sphinx reads what is below this folder, so the tutorials are copied into it.
-TUTORIALS = ("*.ipynb", "09_ros2_and_dds.md", "lanes.py", "test_lanes.py")
-(DOCS / "tutorials").mkdir(exist_ok=True)
-for pattern in TUTORIALS:
+(DOCS / "tutorials").mkdir()
+for pattern in ("*.ipynb", "09_ros2_and_dds.md", "lanes.py", "test_lanes.py"):
     for path in (DOCS.parent / "notebooks").glob(pattern):
         shutil.copy2(path, DOCS / "tutorials")
+
+
+def link_tutorials(app: Sphinx, page: str, source: list[str]) -> None:
+    """Turn a link to a notebook, as it is right in the repository, into one to its page."""
+    source[0] = re.sub(r"\]\(((?:\.\./)*)\.\./notebooks/", r"](\1tutorials/", source[0])
 
 
 def add_examples(app: Sphinx, ctx: click.Context, lines: list[str]) -> None:
@@ -92,6 +101,7 @@ def write_dashes(app: Sphinx, doctree: nodes.document) -> None:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register what this file adds to Sphinx."""
+    app.connect("source-read", link_tutorials)
     app.connect("doctree-read", write_dashes)
     app.connect("sphinx-click-process-epilog", add_examples)
     return {"parallel_read_safe": True}
