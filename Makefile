@@ -42,6 +42,11 @@ lab: $(VENV)/.all
 bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks
 
+# The documentation site: docs/_build/html/index.html. Nothing is downloaded; warnings are errors.
+.PHONY: docs
+docs: $(VENV)/.test
+	$(BIN)/python -m sphinx --quiet --fresh-env --fail-on-warning --keep-going docs docs/_build/html
+
 # After a change in proto/: the messages, as epypes/wire/protobuf.py loads them.
 schema: $(VENV)/.test
 	$(BIN)/python -m grpc_tools.protoc -Iproto --include_imports --descriptor_set_out=epypes/wire/schema.binpb \
@@ -53,6 +58,7 @@ fix: $(VENV)/.test
 
 clean:
 	rm -rf $(VENV) .matrix demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf docs/_build docs/reference/generated docs/tutorials
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.
 $(BIN)/python:
@@ -65,7 +71,7 @@ $(VENV)/.all: pyproject.toml | $(BIN)/python
 	touch $@
 
 $(VENV)/.test: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[all]' --group test
+	$(PIP) --editable '.[all]' --group test --group docs
 	touch $@ $(VENV)/.all
 
 $(VENV)/.bench: pyproject.toml | $(BIN)/python

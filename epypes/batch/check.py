@@ -105,8 +105,8 @@ def check(
     runner
         Its graph and hyperparameters are used; it is left as it is.
     cases
-        ``ep.Case``s, dicts with the parts of one, or the path of a CASES.toml. Of a graph with state the inputs of a
-        case are a sequence: what it gives at its end is measured.
+        ``ep.Case`` objects, dicts with the parts of one, or the path of a CASES.toml. Of a graph with state the inputs
+        of a case are a sequence: what it gives at its end is measured.
     executor
         None runs the cases in this thread; any ``concurrent.futures.Executor`` elsewhere. Metrics are computed here.
     progress
