@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zipfile
 
+import click
 import pytest
 
 pytestmark = pytest.mark.packaging
@@ -42,7 +43,7 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
     ):
         assert name in names
     tops = {name.partition("/")[0] for name in names}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"epypes", "epypes_widgets"}
+    assert {top for top in tops if not top.endswith((".dist-info", ".data"))} == {"epypes", "epypes_widgets"}
 
 
 def test_the_wheel_does_the_main_job_in_a_clean_environment(environment):
@@ -50,6 +51,9 @@ def test_the_wheel_does_the_main_job_in_a_clean_environment(environment):
     assert str(everything.bin.parent) in everything.python(MAIN_JOB)
     done = everything.epypes("verify", "bundle")
     assert done.returncode == 0, done.stderr
+    code = "from jupyter_server.extension.serverextension import main; main(['list'])"
+    listed = click.unstyle(everything.python(code))
+    assert "epypes.jupyter_server_extension enabled" in listed
 
 
 def test_the_core_imports_without_any_extra(environment):
