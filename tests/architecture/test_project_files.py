@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PYTHONS = [each.rpartition(" ")[2] for each in PROJECT["classifiers"] if " :: 3." in each]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 FORMS = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
 BIN = Path(sys.executable).parent
@@ -50,11 +52,9 @@ def test_what_a_workflow_or_a_hook_runs_exists(line):
 
 
 def test_the_workflows_test_every_python_that_is_declared():
-    prefix = "Programming Language :: Python :: 3."
-    declared = [each.rpartition(" ")[2] for each in PROJECT["classifiers"] if each.startswith(prefix)]
     tested = read(ROOT / ".github" / "workflows" / "tests.yml")["jobs"]["python"]["strategy"]["matrix"]["python"]
-    assert tested == declared
-    assert PROJECT["requires-python"] == f">={declared[0]}"
+    assert tested == PYTHONS
+    assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
 
 
 def test_a_release_waits_for_the_tests_and_alone_may_publish():
@@ -84,3 +84,10 @@ def test_the_citation_is_of_the_paper_that_the_package_names():
     assert PROJECT["urls"]["Paper"].endswith(f"/{paper['doi']}")
     assert [author["family-names"] for author in paper["authors"]] == ["Semeniuta", "Falkman"]
     assert citation["license"] == PROJECT["license"]
+
+
+def test_binder_has_a_tested_python_and_every_extra_that_the_tutorials_use():
+    (line,) = [line for line in (ROOT / ".binder" / "requirements.txt").read_text().splitlines() if line[0] != "#"]
+    binder = Requirement(f"epypes{line.removeprefix('.')}")
+    assert binder.extras <= PROJECT["optional-dependencies"].keys()
+    assert PYTHONS[0] == (ROOT / ".binder" / "runtime.txt").read_text().strip().removeprefix("python-")
