@@ -51,10 +51,22 @@ class Environment:
 
 
 @pytest.fixture(scope="session")
-def wheel(tmp_path_factory):
-    out = tmp_path_factory.mktemp("wheel")
-    subprocess.run([*UV, "build", "--quiet", "--wheel", "--out-dir", str(out), str(ROOT)], check=True)
-    (found,) = out.glob("*.whl")
+def distributions(tmp_path_factory):
+    """The folder of the source distribution, and of the wheel that was built from it."""
+    out = tmp_path_factory.mktemp("distributions")
+    subprocess.run([*UV, "build", "--quiet", "--out-dir", str(out), str(ROOT)], check=True)
+    return out
+
+
+@pytest.fixture(scope="session")
+def source_distribution(distributions):
+    (found,) = distributions.glob("*.tar.gz")
+    return found
+
+
+@pytest.fixture(scope="session")
+def wheel(distributions):
+    (found,) = distributions.glob("*.whl")
     return found
 
 

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import click
@@ -163,4 +164,6 @@ def test_h_is_help(epypes, words):
 
 
 def test_version_is_that_of_the_package(epypes):
-    assert epypes("--version").stdout.split() == ["epypes", ep.__version__]
+    module = subprocess.run([sys.executable, "-m", "epypes", "--version"], capture_output=True, text=True, check=True)
+    assert epypes("--version").stdout.split() == module.stdout.split() == ["epypes", ep.__version__]
+    assert ep.__version__ == metadata.version("epypes")
