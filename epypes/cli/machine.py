@@ -167,9 +167,9 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
 
     \b
     bash: add this line to ~/.bashrc
-      eval "$(epypes completion bash)"
+      source <(epypes completion bash)
     zsh: add this line to ~/.zshrc, after compinit
-      eval "$(epypes completion zsh)"
+      source <(epypes completion zsh)
     fish: run this once
       epypes completion fish > ~/.config/fish/completions/epypes.fish
     """  # noqa: D301 - click keeps the lines of a paragraph that begins with it

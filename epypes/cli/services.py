@@ -178,22 +178,22 @@ def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **o
 
     \b
     Addresses:
-    tcp://HOST:PORT           ZeroMQ; the service binds it
-    connect:tcp://HOST:PORT   ZeroMQ; the service connects to it
-    amqp://HOST/QUEUE         RabbitMQ; encrypted: amqps
-    nats://HOST/SUBJECT       NATS JetStream; encrypted: tls
-    mqtt://HOST/TOPIC         MQTT 5; encrypted: mqtts
+    tcp://HOST:PORT           - ZeroMQ; the service binds it
+    connect:tcp://HOST:PORT   - ZeroMQ; the service connects to it
+    amqp://HOST/QUEUE         - RabbitMQ; encrypted: amqps
+    nats://HOST/SUBJECT       - NATS JetStream; encrypted: tls
+    mqtt://HOST/TOPIC         - MQTT 5; encrypted: mqtts
 
     \b
     Options of a broker's address, after ? and separated by & (quote the address):
-    create=true               create the queue if it is missing
-    password_file=FILE        password for USER@HOST; process lists show addresses
-    ca=FILE                   certificates that the broker's certificate is checked by
-    attempts=3                deliver an event at most so often
-    dead=NAME                 queue for events that were delivered too often
-    group=NAME                replicas that share the events (NATS, MQTT)
-    kind=broadcast            send to all consumers, keep nothing
-    vhost=NAME                virtual host of RabbitMQ
+    create=true               - create the queue if it is missing
+    password_file=FILE        - password for USER@HOST; process lists show addresses
+    ca=FILE                   - certificate authority of the broker
+    attempts=3                - largest number of deliveries of one event
+    dead=NAME                 - queue for events that were delivered too often
+    group=NAME                - replicas that share the events (NATS, MQTT)
+    kind=broadcast            - send to all consumers, keep nothing
+    vhost=NAME                - virtual host of RabbitMQ
     """  # noqa: D301 - click keeps the lines of a paragraph that begins with it
     from epypes.service import serve as serve_bundle
     from epypes.service.supervision.standard_error import STANDARD_ERROR

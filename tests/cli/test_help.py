@@ -136,7 +136,7 @@ def test_every_help_has_an_example_that_its_command_takes(words, epypes):
 
 def complete(words, tmp_path):
     """Return what bash offers for the last word of a command line."""
-    script = 'eval "$(epypes completion bash)"; _epypes_completion epypes; printf "%s\\n" "${COMPREPLY[@]}"'
+    script = 'source <(epypes completion bash); _epypes_completion epypes; printf "%s\\n" "${COMPREPLY[@]}"'
     line = f"COMP_WORDS=({' '.join(map(repr, words))}); COMP_CWORD={len(words) - 1}; {script}"
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     done = subprocess.run(
