@@ -89,7 +89,9 @@ class Reader:
         exec(compile(tree, name, "exec"), self.names)
         if isinstance(last, ast.Expr):
             shown = eval(compile(ast.Expression(last.value), name, "eval"), self.names)
-            getattr(shown, "_repr_mimebundle_", lambda **_: repr(shown))(include=None, exclude=None)
+            displayed = getattr(shown, "_repr_mimebundle_", lambda **_: repr(shown))(include=None, exclude=None)
+            # What is shown in place of a preview whose function has raised.
+            assert "no preview" not in str(displayed)
 
     def _line(self, line: str) -> None:
         words = shlex.split(line, comments=True)

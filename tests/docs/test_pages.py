@@ -17,7 +17,7 @@ from tests.docs.pages import BROKER, DOCS, ROOT, Reader, blocks
 from tests.service.processes import run_cli
 
 QUICKSTART = DOCS / "quickstart.md"
-GUIDES = {path.stem: path for path in sorted((DOCS / "guides").glob("*.md"))}
+GUIDES = {path.stem: path for path in sorted((DOCS / "guides").glob("*.md")) if any(blocks(path))}
 BUNDLE = "services/edges"
 
 
