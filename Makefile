@@ -13,7 +13,7 @@ PYTEST := $(BIN)/pytest -n $(PROCESSES) -p schemathesis.pytest.plugin -p nbval.p
 # Hundreds of interpreters are started by the tests: each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test soak test-matrix lab bench schema fix clean
+.PHONY: demo test soak test-matrix lab bench schema dist fix clean
 
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
@@ -52,12 +52,16 @@ schema: $(VENV)/.test
 	$(BIN)/python -m grpc_tools.protoc -Iproto --include_imports --descriptor_set_out=epypes/wire/schema.binpb \
 		epypes2019/messages.proto epypes/v1/envelope.proto foxglove/images.proto
 
+# The wheel and the source distribution of the tree as it is.
+dist: | $(BIN)/python
+	$(BIN)/python -m uv build --quiet --out-dir dist
+
 fix: $(VENV)/.test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .matrix demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf $(VENV) .matrix dist demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
 	rm -rf docs/_build docs/reference/generated docs/tutorials
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.

@@ -152,8 +152,6 @@ _HOMES = {
     "verify": "epypes.bundle",
 }
 
-__version__ = "1.0.0.dev0"
-
 __all__ = [
     "Case",
     "CompGraph",
@@ -224,6 +222,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        # Its import takes some 20 ms.
+        from importlib.metadata import version
+
+        return globals().setdefault(name, version("epypes"))
     home = _HOMES.get(name)
     if home is None:
         way_out = ": from epypes_widgets import tune" if name == "tune" else ""

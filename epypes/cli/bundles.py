@@ -21,15 +21,18 @@ if TYPE_CHECKING:
 
 
 @command("epypes promote 01_edge_detection.ipynb --name runner --output edges --to services/edges")
-@click.argument("notebook", type=PATH, help="Notebook; it is executed in a new kernel and not changed.")
-@click.option("--to", type=PATH, required=True, help="Folder of the bundle; an existing bundle is replaced.")
-@click.option("--name", default="runner", help="Variable that holds the runner or pipeline.")
-@click.option("--output", multiple=True, help="Token of the service's answers; may be repeated.")
-@click.option("--sample", multiple=True, help="Variable with a further payload, or a list of them; may be repeated.")
+@click.argument("notebook", type=PATH, help="Notebook file. It is not changed.")
+@click.option("--to", type=PATH, required=True, help="Folder to write. An existing bundle is replaced.")
+@click.option("--name", default="runner", help="Variable of the notebook that holds the runner or pipeline.")
+@click.option("--output", multiple=True, help="Token to answer with; default: all sink tokens. May be repeated.")
+@click.option(
+    "--sample", multiple=True, help="Variable with one more payload, or a list of them, to record. May be repeated."
+)
 def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: Sequence[str]) -> None:
-    """Write the graph of a notebook as a bundle, and verify it.
+    """Write the graph of a notebook to a bundle, and verify it.
 
-    The notebook is executed in a new kernel. The bundle is replayed in fresh processes, and must compute the same.
+    The notebook runs in a new kernel, and its payloads are recorded as samples. The bundle then computes the samples in
+    fresh processes. If any token differs from what the notebook computed, the command fails.
     """
     run_promotion(notebook, to, name, output, sample)
     click.echo(f"Promoted {name!r} of {notebook} to {to}: replayed identical in fresh processes.")
@@ -60,19 +63,21 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], s
 
 @command("epypes verify services/edges", "epypes verify services/edges --fresh-env")
 @bundle_argument
-@click.option("--fresh-env", is_flag=True, help="Replay in a new environment, made from requirements.txt alone.")
+@click.option("--fresh-env", is_flag=True, help="Replay in a new virtual environment of requirements.txt.")
 @click.option(
-    "--run-anyway", is_flag=True, help="Replay changed files too, which runs the changed code; exits non-zero."
+    "--run-anyway",
+    is_flag=True,
+    help="Run the code although files were changed, to see which tokens differ. The exit status is still 1.",
 )
 @json_option
 def verify(bundle: Path, fresh_env: bool, run_anyway: bool, as_json: bool) -> None:
-    """Replay a bundle's samples in a fresh process.
+    """Check that a bundle computes what the notebook computed.
 
-    Exit 0 only if every token is as it was recorded.
+    The command computes the recorded samples in a fresh process (a replay) and compares every token. The exit status is
+    0 only if all tokens are identical.
 
-    A bundle is code: trust it like code. The manifest shows changes, and is no signature.
-
-    If a file is not what the manifest says, nothing of the bundle is run.
+    A bundle is code: trust it like code. If a file has changed since promotion, nothing of the bundle is run. The
+    manifest shows changes; it is no signature.
     """
     from epypes.bundle import verify as verify_bundle
 
@@ -104,15 +109,13 @@ def _describe_difference(bundle: Path, report: ReplayReport) -> str:
 
 @command("epypes check services/edges cases.toml --junit report.xml")
 @bundle_argument
-@click.argument("cases", type=PATH, metavar="CASES.toml", help="File of the cases.")
-@click.option("--junit", type=PATH, help="File for JUnit XML, for continuous integration.")
+@click.argument("cases", type=PATH, metavar="CASES.toml", help="File with the cases.")
+@click.option("--junit", type=PATH, help="File to write as JUnit XML, for continuous integration.")
 @json_option
 def check(bundle: Path, cases: Path, junit: Path | None, as_json: bool) -> None:
-    """Run a bundle on a labelled set of images.
+    """Test a bundle on images with known results.
 
-    Exit 0 only if every case passes.
-
-    A file of cases:
+    The exit status is 0 only if every case passes. The cases are in a TOML file:
 
     \b
     [[case]]
@@ -128,9 +131,11 @@ def check(bundle: Path, cases: Path, junit: Path | None, as_json: bool) -> None:
     min = 0.9                          # the lowest value that passes
     max = 1.0                          # the highest value that passes
 
-    A text with the suffix of an image, .npy or .npz is a file; its path is relative to the file of cases.
-    Metrics, with their options: equal, close (atol, rtol), iou (boxes), count (of), value, mean_abs_difference,
-    psnr (data_range). A check may have a name. A case without a check passes if it runs.
+    A value that ends like an image file, .npy or .npz is read as a file; its path is relative to the TOML file.
+
+    The metrics are equal, close, iou, count, value, mean_abs_difference and psnr. Their options are further keys of the
+    check: atol and rtol (close), boxes (iou), of (count), data_range (psnr). The key name names a check. A case
+    without a check passes if all functions succeed.
     """  # noqa: D301 - click keeps the lines of a paragraph that begins with it
     from epypes.batch.cases import cases_of
     from epypes.batch.check import check as check_runner

@@ -34,7 +34,7 @@ _address_option: Final = functools.partial(
     click.option,
     default="",
     show_default=False,
-    help="Address that epypes serve was given; needed if the broker has a password.",
+    help="Same address as for epypes serve. Needed only if the broker has a password.",
 )
 
 
@@ -44,22 +44,27 @@ _address_option: Final = functools.partial(
 )
 @bundle_argument
 @click.argument(
-    "images", nargs=-1, required=True, help="Image file or number; or TOKEN=FILE, TOKEN=NUMBER for each input token."
+    "images",
+    nargs=-1,
+    required=True,
+    help="Image file or number. With several inputs: TOKEN=FILE or TOKEN=NUMBER for each.",
 )
 @click.option(
-    "--out", multiple=True, help="File for the output token: an image or .npy; or TOKEN=FILE; may be repeated."
+    "--out",
+    multiple=True,
+    help="File to write the answer to: an image or .npy. With several outputs: TOKEN=FILE. May be repeated.",
 )
-@seconds_option("--timeout", 10.0, "Longest wait for the answer", least=0.001)
-@click.option("--count", type=click.IntRange(1), default=1, help="Number of calls; the times are those of the fastest.")
-@click.option("--json", "as_json", is_flag=True, help="Print the answer as JSON, with the times in nanoseconds.")
+@seconds_option("--timeout", 10.0, "Seconds to wait for the answer.", least=0.001)
+@click.option("--count", type=click.IntRange(1), default=1, help="Number of calls; prints the times of the fastest.")
+@click.option("--json", "as_json", is_flag=True, help="Print the answer as JSON, with times in nanoseconds.")
 @keys_option
 @allow_option
 @_address_option("--sub")
 @_address_option("--pub")
 def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as_json: bool, **options: Any) -> None:
-    """Send an image to a service, and write its answer to a file.
+    """Send an image to a running service, and save its answer.
 
-    A service with several input tokens needs one value for each. An answer without --out is printed.
+    Without --out the answer is printed. The service is found by the folder of its bundle.
     """
     from epypes.bundle.manifest import SETTINGS, check_manifest
     from epypes.bundle.settings import read_settings
@@ -204,14 +209,15 @@ def _write(file: str, value: Any, order: Order) -> None:
 
 
 @command("epypes demo 01_edge_detection.ipynb --output edges")
-@click.argument("notebook", type=PATH, help="Notebook with a runner.")
-@click.option("--to", type=PATH, default="demo-output", help="Folder for the results.")
-@click.option("--name", default="runner", help="Variable that holds the runner.")
-@click.option("--output", default="edges", help="Image token of the service's answers.")
+@click.argument("notebook", type=PATH, help="Notebook file. It is not changed.")
+@click.option("--to", type=PATH, default="demo-output", help="Folder to write the results to.")
+@click.option("--name", default="runner", help="Variable of the notebook that holds the runner.")
+@click.option("--output", default="edges", help="Token to answer with; its value is an image.")
 def demo(notebook: Path, to: Path, name: str, output: str) -> None:
-    """Promote, verify, serve, call and compare a notebook's graph.
+    """Go the whole way once: promote, verify, serve and call.
 
-    The service runs in a second process and is called from a third; its answer must be what the notebook computed.
+    The service runs in a second process and is called from a third. If its answer differs from what the notebook
+    computed, the command fails.
     """
     from epypes.acquisition import read_image, write_image
     from epypes.bundle import verify

@@ -18,20 +18,21 @@ _MAX_DRAWINGS: Final = 200
 
 
 @command("epypes experiment --layout one --requests 100 --experiments 2 --out figures")
-@click.option("--layout", default="paper", help="How the nodes are spread over processes: paper, one or three.")
-@click.option("--requests", default=500, help="Number of requests in each experiment, one after another.")
-@click.option("--experiments", default=5, help="Number of experiments; each starts all processes anew.")
-@click.option("--workers", default=1, help="Number of the graph's functions that may run at once.")
-@click.option("--fps", default=5.0, help="Frames per second of cameras that are files.")
-@click.option("--camera", multiple=True, help="Image, folder, video or device number; twice. Default: a stereo pair.")
-@seconds_option("--timeout", 5.0, "Longest wait for one answer")
-@click.option("--unsafe-pickle", is_flag=True, help="Send and read pickled contents, as in 2019.")
-@click.option("--out", "to", type=PATH, help="Folder for requests.csv and Figures 14, 15 and 16 as SVG.")
+@click.option("--layout", default="paper", help="Processes of the nodes: paper, one or three.")
+@click.option("--requests", default=500, help="Number of requests in each experiment.")
+@click.option("--experiments", default=5, help="Number of experiments. Each starts new processes.")
+@click.option("--workers", default=1, help="Number of functions that may run at the same time.")
+@click.option("--fps", default=5.0, help="Frames per second of a camera that is a file.")
+@click.option("--camera", multiple=True, help="Camera: image, folder, video or device number. Give two.")
+@seconds_option("--timeout", 5.0, "Seconds to wait for one answer.")
+@click.option("--unsafe-pickle", is_flag=True, help="Pickle the answers, as in 2019. A pickle can run any code.")
+@click.option("--out", "to", type=PATH, help="Folder for requests.csv and the Figures 14 to 16 (SVG).")
 def experiment(layout: str, workers: int, camera: Sequence[str], to: Path | None, **options: Any) -> None:
-    """Run the experiment of the paper.
+    """Run the experiment of the paper, and print its times.
 
-    A robot asks, acquisition finds the images, vision finds the keypoints. In layout paper, acquisition and vision
-    share a process; in layout one, all run in this process; in layout three, each has a process of its own.
+    The robot node sends a request, the acquisition node finds the pair of images that is closest in time, and the
+    vision node matches keypoints. With --layout paper, acquisition and vision share a process; with one, all nodes run
+    in this process; with three, each has its own. Without --camera the images are a stereo pair of scikit-image.
     """
     from epypes.experiment import run_experiment
 

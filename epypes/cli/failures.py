@@ -26,17 +26,17 @@ _MAX_CHARACTERS: Final = 200
 
 @command("epypes failures services/edges", "epypes failures services/edges --follow")
 @any_source_argument
-@click.option("--limit", type=click.IntRange(1), default=20, help="Number of failures, newest first.")
-@click.option("--json", "as_json", is_flag=True, help="Print each failure as a line of JSON.")
-@click.option("--follow", is_flag=True, help="Print new failures as they happen, until Ctrl+C.")
+@click.option("--limit", type=click.IntRange(1), default=20, help="Number of failures to list, newest first.")
+@click.option("--json", "as_json", is_flag=True, help="Print each failure as one line of JSON.")
+@click.option("--follow", is_flag=True, help="Print new failures when they happen, until Ctrl+C.")
 @keys_option
 @allow_option
 def failures(
     source: str | None, limit: int, as_json: bool, follow: bool, keys: Path | None, allow: Sequence[Path] | None
 ) -> None:
-    """List the failures of a service.
+    """List the events that failed in a service.
 
-    epypes replay ID runs one of them again.
+    epypes replay ID runs one of them again; ep.load_failure(ID) opens it in a notebook.
     """
     from epypes.service.failures.source import failures_of
 
@@ -105,15 +105,15 @@ def _print_failures(records: Sequence[FailedEvent]) -> None:
 
 
 @command("epypes replay latest services/edges --trace")
-@click.argument("failure", metavar="ID", help="Id of the failure, its beginning or end, its event's id, or latest.")
+@click.argument("failure", metavar="ID", help="Id of the failure, its beginning or end, id of the event, or latest.")
 @any_source_argument
-@click.option("--bundle", type=PATH, help="Folder of the bundle, if it was served from another path.")
-@seconds_option("--timeout", 30.0, "Longest time for the event", least=0.001)
-@click.option("--trace", is_flag=True, help="Print the whole traceback.")
+@click.option("--bundle", type=PATH, help="Folder of the bundle, if it has moved.")
+@seconds_option("--timeout", 30.0, "Seconds that the event may take.", least=0.001)
+@click.option("--trace", is_flag=True, help="Print the full traceback.")
 def replay(failure: str, source: str | None, bundle: Path | None, timeout_s: float, trace: bool) -> None:
     """Run a failed event again, in a separate process.
 
-    Exit 0 only if no function fails now.
+    The exit status is 0 only if every function succeeds now.
     """
     from epypes.service.failures.reproduce import reproduce
     from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of

@@ -1,9 +1,4 @@
-"""The command lab: JupyterLab, whose kernel's messages reach the page without delay.
-
-JupyterLab loads this module as a server extension when ``epypes lab`` starts it. TCP holds a small message back while
-an earlier one is not acknowledged (Nagle, RFC 896), and the other end delays its acknowledgement by 40 ms;
-``TCP_NODELAY`` ends that.
-"""
+"""The command lab, which starts JupyterLab for this machine alone."""
 
 from __future__ import annotations
 
@@ -11,27 +6,24 @@ import importlib.util
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import click
 
 from epypes.cli.options import command
 from epypes.errors import ServiceError
 
-if TYPE_CHECKING:
-    from jupyter_server.serverapp import ServerApp
-
 _ADDRESS: Final = ("--ip", "--ServerApp.ip")
-_CONNECTION_CLASS: Final = "kernel_websocket_connection_class"
 
 
 @command("epypes lab notebooks", "epypes lab -- --port 8899 --no-browser")
-@click.argument("arguments", nargs=-1, metavar="[FOLDER] [-- OPTIONS]", help="Folder to open; options of JupyterLab.")
+@click.argument(
+    "arguments", nargs=-1, metavar="[FOLDER] [-- OPTIONS]", help="Folder to open, and options of JupyterLab."
+)
 def lab(arguments: tuple[str, ...]) -> None:
-    """Start JupyterLab on this machine.
+    """Start JupyterLab for this machine alone.
 
-    Without a folder it opens the current one. It listens on this machine alone, and its kernel websocket sends at once
-    (TCP_NODELAY). Ctrl+C ends it.
+    It opens the folder, by default the current one, and listens on 127.0.0.1. Ctrl+C ends it.
     """
     command = lab_command(*arguments, is_root=os.geteuid() == 0)
     if importlib.util.find_spec("jupyterlab") is None:
@@ -62,30 +54,5 @@ def lab_command(*arguments: str, is_root: bool = False) -> tuple[str, ...]:
         # JupyterLab refuses an address that is given twice.
         *(() if any(option.partition("=")[0] in _ADDRESS for option in options) else ("--ip=127.0.0.1",)),
         *(("--allow-root",) if is_root else ()),
-        f"--ServerApp.jpserver_extensions={__name__}=True",
         *options,
     )
-
-
-def _jupyter_server_extension_points() -> list[dict[str, str]]:
-    return [{"module": __name__}]
-
-
-def _load_jupyter_server_extension(server: ServerApp) -> None:
-    from jupyter_server.services.kernels.connection.channels import ZMQChannelsWebsocketConnection
-
-    # The class that the user configured is extended. That of a gateway is left alone: its kernels are elsewhere.
-    settings = server.web_app.settings
-    if issubclass(settings[_CONNECTION_CLASS], ZMQChannelsWebsocketConnection):
-        settings[_CONNECTION_CLASS] = _undelayed(settings[_CONNECTION_CLASS])
-
-
-def _undelayed(connection: type[Any]) -> type[Any]:
-    """Return a subclass of a connection between page and kernel whose socket sends at once."""
-
-    def connect(self: Any) -> Any:
-        # Before anything is sent.
-        self.websocket_handler.set_nodelay(True)
-        return connection.connect(self)
-
-    return type("Undelayed", (connection,), {"connect": connect})

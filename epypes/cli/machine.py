@@ -1,4 +1,4 @@
-"""Commands that prepare a machine for a service: keys, doctor, export."""
+"""Commands that prepare a machine: doctor, keys, export, completion."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import click
 
@@ -20,17 +20,19 @@ from epypes.errors import KeysError, ServiceError
 _NAME: Final = re.compile(r"\w[\w-]*")
 _COLOURS: Final = {"ok": "green", "warning": "yellow", "failed": "red"}
 
-_serve_options: Final = click.argument("options", nargs=-1, metavar="-- OPTIONS", help="Options of epypes serve.")
+_serve_options: Final = click.argument(
+    "options", nargs=-1, metavar="-- OPTIONS", help="Options of epypes serve, as in the example."
+)
 
 
 @command("epypes keys camera --to keys", "epypes keys --list")
-@click.argument("name", default="", help="Name of the pair, as camera or robot; optional with --list.")
-@click.option("--to", "folder", type=PATH, help="Folder of the keys; default: ~/.config/epypes/keys.")
-@click.option("--list", "listed", is_flag=True, help="Print the public keys in the folder; make none.")
+@click.argument("name", default="", help="Name of the pair, such as camera or robot. Optional with --list.")
+@click.option("--to", "folder", type=PATH, help="Folder of the key files. Default: ~/.config/epypes/keys.")
+@click.option("--list", "listed", is_flag=True, help="List the public keys in the folder, and create none.")
 def keys(name: str, folder: Path | None, listed: bool) -> None:
-    """Make a pair of CURVE keys.
+    """Create a key pair for encrypted connections (ZeroMQ CURVE).
 
-    The output explains which machine needs which file.
+    The output says which file belongs on which machine.
     """
     from epypes.transport import make_keys
 
@@ -73,14 +75,15 @@ def _secret_state(file: Path) -> str:
 
 
 @command("epypes doctor services/edges --address tcp://127.0.0.1:5555")
-@click.argument("bundle", type=PATH, required=False, help="Bundle to serve, or being served.")
-@click.option("--address", multiple=True, help="Address to bind, or of a broker; may be repeated.")
-@click.option("--keys", type=PATH, multiple=True, help="File of keys to be used; may be repeated.")
+@click.argument("bundle", type=PATH, required=False, help="Folder of a bundle to check, too.")
+@click.option("--address", multiple=True, help="Address to check: one to bind, or a broker's. May be repeated.")
+@click.option("--keys", type=PATH, multiple=True, help="Key file to check. May be repeated.")
 @json_option
 def doctor(bundle: Path | None, address: Sequence[str], keys: Sequence[Path], as_json: bool) -> None:
-    """Check versions, ports, Graphviz, browser, keys, round trips.
+    """Check whether this machine has what a service needs.
 
-    Exit 1 if a check failed.
+    It checks versions, extras, OpenCV, Graphviz, the browser, ports, keys and the round-trip time of a message, and
+    prints advice. The exit status is 1 if a check fails.
     """
     from epypes.service.ops.doctor import examine
 
@@ -102,21 +105,21 @@ def doctor(bundle: Path | None, address: Sequence[str], keys: Sequence[Path], as
 
 @click.group(cls=Group, examples=["epypes export systemd services/edges -- --http 127.0.0.1:8642"])
 def export() -> None:
-    """Write a systemd unit or a container file for a bundle.
+    """Write the files to run a service by systemd or in a container.
 
-    Options of epypes serve follow after two dashes.
+    Options of epypes serve follow after two dashes (--).
     """
 
 
 @export.command(examples=["epypes export systemd services/edges --to /etc/systemd/system -- --http 127.0.0.1:8642"])
 @bundle_argument
 @_serve_options
-@click.option("--to", type=PATH, help="File, or folder for it; default: standard output.")
-@click.option("--user", default=getpass.getuser, show_default="you", help="User that runs the service.")
+@click.option("--to", type=PATH, help="File or folder to write to. Default: print the unit.")
+@click.option("--user", default=getpass.getuser, show_default="you", help="User account that runs the service.")
 def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) -> None:
-    """Write a systemd unit for the service.
+    """Write a systemd unit that serves the bundle.
 
-    systemd then starts the service at boot, and restarts it when it ends.
+    systemd starts the service at boot, and restarts it when it ends.
     """
     from epypes.service.ops.export import systemd_unit, unit_name
 
@@ -135,11 +138,11 @@ def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) ->
 )
 @bundle_argument
 @_serve_options
-@click.option("--to", type=PATH, required=True, help="Folder to write; it must not exist yet.")
+@click.option("--to", type=PATH, required=True, help="Folder to write. It must not exist yet.")
 def docker(bundle: Path, options: Sequence[str], to: Path) -> None:
-    """Write a build folder for docker or podman.
+    """Write a folder that docker or podman builds an image from.
 
-    It has a container file, the requirements and the bundle.
+    It has a Containerfile, the requirements and a copy of the bundle.
     """
     from epypes.service.ops.export import write_container
 
@@ -153,3 +156,24 @@ def _check_serve_options(bundle: Path, options: Sequence[str]) -> None:
     from epypes.cli.services import serve
 
     serve.make_context("epypes serve", [str(bundle), *options])
+
+
+@command("epypes completion bash")
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]), help="Shell that runs the script.")
+def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
+    """Print a script that completes commands with the Tab key.
+
+    It completes options, their choices and files, too.
+
+    \b
+    bash: add this line to ~/.bashrc
+      source <(epypes completion bash)
+    zsh: add this line to ~/.zshrc, after compinit
+      source <(epypes completion zsh)
+    fish: run this once
+      epypes completion fish > ~/.config/fish/completions/epypes.fish
+    """  # noqa: D301 - click keeps the lines of a paragraph that begins with it
+    from click.shell_completion import get_completion_class
+
+    app = click.get_current_context().find_root().command
+    click.echo(get_completion_class(shell)(app, {}, "epypes", "_EPYPES_COMPLETE").source())

@@ -84,11 +84,11 @@ def command(*examples: str, name: str | None = None) -> Callable[[Callable[..., 
 
 
 bundle_argument: Final = click.argument("bundle", type=PATH, help="Folder of the bundle.")
-source_argument: Final = click.argument("source", help="Folder of the served bundle, or http URL of the service.")
+source_argument: Final = click.argument("source", help="Folder of the served bundle, or URL of the service.")
 any_source_argument: Final = click.argument(
     "source",
     required=False,
-    help="Folder of the served bundle, or http URL of the service; default: all on this machine.",
+    help="Folder of the served bundle, or URL of the service. Default: all services of this machine.",
 )
 
 
@@ -100,28 +100,30 @@ def refuse_nan(context: click.Context, option: click.Parameter, value: float | N
 
 
 def seconds_option(name: str, default: float, text: str, least: float = 0.0) -> Callable[[Callback], Callback]:
-    """Return an option for a duration in seconds, whose parameter ends in ``_s``."""
+    """Return an option for a duration, whose text begins with "Seconds" and whose parameter ends in ``_s``."""
     parameter = f"{name.removeprefix('--').replace('-', '_')}_s"
     range_ = click.FloatRange(least)
-    help_ = f"{text}, in seconds."
-    return click.option(name, parameter, type=range_, default=default, callback=refuse_nan, help=help_)
+    return click.option(name, parameter, type=range_, default=default, callback=refuse_nan, help=text)
 
 
 json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 replica_option: Final = click.option(
-    "--replica", default="", show_default=False, help="Name of one replica, if several of the bundle run here."
+    "--replica", default="", show_default=False, help="Name of one replica, if several run on this machine."
 )
 access_key_option: Final = click.option(
     "--access-key-file",
     type=PATH,
-    help="File with the service's access key; default: EPYPES_ACCESS_KEY, or that of a service here.",
+    help="File with the access key of the service. Default: the variable EPYPES_ACCESS_KEY; for a service on this "
+    "machine the file that it has written.",
 )
-insecure_option: Final = click.option("--insecure", is_flag=True, help="Bind addresses that other machines can reach.")
-keys_option: Final = click.option("--keys", type=PATH, help="The .key_secret file of this side; epypes keys makes it.")
+insecure_option: Final = click.option(
+    "--insecure", is_flag=True, help="Allow addresses that other machines can reach, without keys."
+)
+keys_option: Final = click.option("--keys", type=PATH, help="Own secret key (.key_secret); epypes keys creates it.")
 allow_option: Final = click.option(
     "--allow",
     type=PATH,
     multiple=True,
     callback=lambda context, option, value: list(value) or None,
-    help="The .key file of an allowed peer, or a folder of them; may be repeated.",
+    help="Public key (.key) of a peer that may connect, or a folder of such files. May be repeated.",
 )

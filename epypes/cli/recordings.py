@@ -23,10 +23,10 @@ _SPEED: Final = click.FloatRange(0.0)
 
 
 @command("epypes record tcp://127.0.0.1:5556 answers.mcap --seconds 60")
-@click.argument("address", help="Address of the publisher; bind:ADDRESS binds.")
+@click.argument("address", help="Address of the publisher. bind:ADDRESS binds in place of connecting.")
 @click.argument("file", type=PATH, help="MCAP file to write.")
-@click.option("--topic", default="", show_default=False, help="Record only this topic and those below it.")
-@click.option("--seconds", type=click.FloatRange(0.0), callback=refuse_nan, help="Stop after this time.")
+@click.option("--topic", default="", show_default=False, help="Record only this topic and the topics below it.")
+@click.option("--seconds", type=click.FloatRange(0.0), callback=refuse_nan, help="Stop after this number of seconds.")
 @click.option("--messages", type=click.IntRange(1), help="Stop after this number of messages.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @insecure_option
@@ -35,9 +35,10 @@ _SPEED: Final = click.FloatRange(0.0)
 def record(
     address: str, file: Path, topic: str, seconds: float | None, messages: int | None, force: bool, **access: Any
 ) -> None:
-    """Record published messages in a file.
+    """Record the messages of a publisher in a file.
 
-    The recording ends at SIGTERM or Ctrl+C, or after a time or number of messages. Foxglove shows its images.
+    The recording ends at Ctrl+C or SIGTERM, or after --seconds or --messages. epypes play publishes it again, and
+    Foxglove shows its images.
     """
     from epypes.service.serving import SignalWait
     from epypes.transport import Recorder
@@ -56,23 +57,29 @@ def record(
 
 
 @command("epypes play answers.mcap tcp://127.0.0.1:5555 --speed 2")
-@click.argument("file", type=PATH, help="MCAP file that epypes record wrote.")
+@click.argument("file", type=PATH, help="MCAP file of epypes record.")
 @click.argument(
-    "address", default="tcp://127.0.0.1:*", help="Address to bind (default: any port); connect:ADDRESS connects."
+    "address",
+    default="tcp://127.0.0.1:*",
+    help="Address to bind; default: a free port. connect:ADDRESS connects in place of binding.",
 )
 @click.option(
-    "--speed", type=_SPEED, default=1.0, callback=refuse_nan, help="2 is twice as fast; 0 as fast as possible."
+    "--speed",
+    type=_SPEED,
+    default=1.0,
+    callback=refuse_nan,
+    help="Speed factor: 2 is twice as fast, 0 sends without pauses.",
 )
-@click.option("--loop", type=click.IntRange(0), default=1, help="Number of times; 0 is until Ctrl+C.")
-@click.option("--wait/--no-wait", default=True, help="Wait for a subscriber before the first message.")
-@click.option("--info", "only_info", is_flag=True, help="Print the content of the file; send nothing.")
+@click.option("--loop", type=click.IntRange(0), default=1, help="Number of times to play the file; 0: until Ctrl+C.")
+@click.option("--wait/--no-wait", default=True, help="Wait for a subscriber before the first message is sent.")
+@click.option("--info", "only_info", is_flag=True, help="Print what the file contains, and send nothing.")
 @insecure_option
 @keys_option
 @allow_option
 def play(file: Path, address: str, speed: float, loop: int, wait: bool, only_info: bool, **access: Any) -> None:
     """Publish the messages of a recording again.
 
-    The intervals between them are those of the recording.
+    The time between two messages is that of the recording, divided by --speed.
     """
     from epypes.service.serving import SignalWait
     from epypes.transport import Player

@@ -48,7 +48,7 @@ _service_option: Final = click.option(
     "--service",
     "source",
     required=True,
-    help="URL of the service, as http://127.0.0.1:8642, or the bundle that it was started with.",
+    help="URL of the service, such as http://127.0.0.1:8642, or the folder of the bundle that it was started with.",
 )
 
 
@@ -56,7 +56,7 @@ _state_option: Final = click.option(
     "--state",
     type=click.Choice(["keep", "reset"]),
     show_default="keep if both bundles delay the same tokens",
-    help="What becomes of the state between events.",
+    help="Keep or reset the state between events (ep.delay).",
 )
 
 # -- which service a command is about ---------------------------------------------------------------------------------
@@ -133,47 +133,68 @@ def describe_failures(address: str, is_shown: bool) -> str:
     "epypes serve services/edges --sub 'amqp://127.0.0.1/frames?create=true' --pub amqp://127.0.0.1/edges",
 )
 @bundle_argument
-@click.option("--sub", default=_ANY_PORT, help="Address of events: one to bind, connect:ADDRESS, or a broker's queue.")
-@click.option("--pub", default=_ANY_PORT, help="Address of answers: one to bind, connect:ADDRESS, or a broker's queue.")
-@click.option("--failures", default=_ANY_PORT, help="Extra address that receives only failures, as --pub.")
-@click.option("--http", default="", help="Address of the HTTP control, as 127.0.0.1:8642.", show_default="none")
+@click.option("--sub", default=_ANY_PORT, help="Address that events come from.")
+@click.option("--pub", default=_ANY_PORT, help="Address that answers go to.")
+@click.option("--failures", default=_ANY_PORT, help="Extra address that receives only failures.")
+@click.option("--http", default="", help="Address of the live page and of HTTP control.", show_default="none")
 @click.option(
     "--threads",
     type=click.IntRange(1, 64),
     default=1,
-    help="Number of events computed at once; answers in order, with --state-per source those of one source.",
+    help="Number of events to compute at the same time. Answers keep the order of the events; with --state-per source "
+    "those of each source.",
 )
-@seconds_option("--job-timeout", 30.0, "Longest time for one event, until the worker is replaced", least=0.01)
-@seconds_option("--drain-timeout", 5.0, "Longest wait for accepted events after SIGTERM")
-@click.option("--retries", type=click.IntRange(0), default=1, help="Retries of an event that kills the worker.")
-@click.option("--mailbox", default="drop_oldest", help="When too many events wait: drop_oldest, latest or fault.")
-@click.option("--mailbox-size", type=click.IntRange(1), default=8, help="Number of events that may wait; 1 for latest.")
+@seconds_option("--job-timeout", 30.0, "Seconds that one event may take; then the worker is replaced.", least=0.01)
+@seconds_option("--drain-timeout", 5.0, "Seconds to answer accepted events after SIGTERM.")
+@click.option("--retries", type=click.IntRange(0), default=1, help="Number of retries if an event crashes the worker.")
+@click.option(
+    "--mailbox",
+    default="drop_oldest",
+    help="Policy when too many events wait: drop_oldest, latest (only the newest waits) or fault (refuse the new one).",
+)
+@click.option("--mailbox-size", type=click.IntRange(1), default=8, help="Number of events that may wait.")
 @insecure_option
 @keys_option
 @allow_option
-@click.option("--access-key-file", type=PATH, help="File of the HTTP control's access key; default: a new one.")
-@click.option("--store", help="SQLite file (extra store) or database URL (extra postgres), for a row per event.")
-@click.option("--replica", default="", show_default="a number", help="Name among the replicas that share a queue.")
+@click.option("--access-key-file", type=PATH, help="File of the access key for HTTP; created if missing.")
+@click.option("--store", help="SQLite file or PostgreSQL URL, for one row per event.")
+@click.option(
+    "--replica", default="", show_default="a number", help="Name among services that share a broker's events."
+)
 @click.option(
     "--state-per",
     type=click.Choice(["one", "source"]),
     default="one",
-    help="State between events: one for all, or one for each source of events.",
+    help="Keep one state between events (ep.delay) for all events, or one for each source of events (camera).",
 )
-@click.option("--partitioned", is_flag=True, help="The broker delivers all events of one source to one replica.")
+@click.option(
+    "--partitioned", is_flag=True, help="Declare that the broker sends all events of a source to one replica."
+)
 def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **options: Any) -> None:
     """Serve a bundle until SIGTERM or Ctrl+C.
 
-    Events come from a SUB socket or a broker's queue, answers go to a PUB socket or a broker's queue. Failures also
-    arrive as answers.
+    A worker process computes the graph for each event, and the service publishes an answer: the output tokens, or the
+    failure. Without --sub and --pub it binds free ports of this machine, which epypes call finds.
 
-    A broker's address is amqp://, nats:// or mqtt://[USER@]HOST/NAME.
+    \b
+    Addresses:
+    tcp://HOST:PORT           - ZeroMQ; the service binds it
+    connect:tcp://HOST:PORT   - ZeroMQ; the service connects to it
+    amqp://HOST/QUEUE         - RabbitMQ; encrypted: amqps
+    nats://HOST/SUBJECT       - NATS JetStream; encrypted: tls
+    mqtt://HOST/TOPIC         - MQTT 5; encrypted: mqtts
 
-    Its password is read from a file, ?password_file=PATH, since process lists show addresses.
-
-    More options follow with & (quote the address): create=true, attempts=3, dead=NAME, group=NAME, kind=broadcast,
-    vhost=NAME, ca=FILE.
-    """
+    \b
+    Options of a broker's address, after ? and separated by & (quote the address):
+    create=true               - create the queue if it is missing
+    password_file=FILE        - password for USER@HOST; process lists show addresses
+    ca=FILE                   - certificate authority of the broker
+    attempts=3                - largest number of deliveries of one event
+    dead=NAME                 - queue for events that were delivered too often
+    group=NAME                - replicas that share the events (NATS, MQTT)
+    kind=broadcast            - send to all consumers, keep nothing
+    vhost=NAME                - virtual host of RabbitMQ
+    """  # noqa: D301 - click keeps the lines of a paragraph that begins with it
     from epypes.service import serve as serve_bundle
     from epypes.service.supervision.standard_error import STANDARD_ERROR
 
@@ -223,12 +244,12 @@ def _is_log(stream: TextIO) -> bool:
 
 @command("epypes stop services/edges")
 @source_argument
-@seconds_option("--timeout", 30.0, "Longest wait for its end")
+@seconds_option("--timeout", 30.0, "Seconds to wait until the service has ended.")
 @replica_option
 def stop(source: str, timeout_s: float, replica: str) -> None:
     """Stop a running service; accepted events are answered first.
 
-    SIGTERM goes to all services of the bundle that this user runs on this machine, or to one named replica.
+    The command sends SIGTERM to all services of the bundle that you run on this machine, or to one replica.
     """
     states = states_of(source, replica)
     end_s = monotonic() + min(timeout_s, TIMEOUT_MAX)
@@ -261,14 +282,14 @@ def _terminate(state: ServiceState, opened: ExitStack) -> int | None:
 
 @command("epypes set services/edges canny_lo=90 blur_kernel=5", name="set")
 @source_argument
-@click.argument("values", nargs=-1, required=True, help="NAME=VALUE, as sigma=1.4 or method=sobel.")
+@click.argument("values", nargs=-1, required=True, help="NAME=VALUE, such as sigma=1.4 or method=sobel.")
 @access_key_option
 @replica_option
 def set_parameters(source: str, values: Sequence[str], access_key_file: Path | None, replica: str) -> None:
-    """Set hyperparameters of a running service.
+    """Change hyperparameters of a running service.
 
-    All values change together, between two events. Replicas that share a queue take them over. epypes deploy resets
-    them.
+    All values change together, between two events, and in all replicas. epypes deploy replaces them by those of the
+    new bundle.
     """
     wanted = dict(_parse_assignment(text) for text in values)
     with connect_to(source, access_key_file, replica) as service:
@@ -292,14 +313,14 @@ def _parse_assignment(text: str) -> tuple[str, Any]:
 
 @command("epypes reset services/lane --source left")
 @source_argument
-@click.option("--source", "event_source", help="Source of events whose state alone is reset.", show_default="all")
+@click.option("--source", "event_source", help="Reset the state of this source of events alone.", show_default="all")
 @access_key_option
 @replica_option
 def reset(source: str, event_source: str | None, access_key_file: Path | None, replica: str) -> None:
-    """Reset the state between events of a running service.
+    """Reset the state between events (ep.delay) of a running service.
 
-    The next event begins with the initial values of the delays, as the first one did. Stopping a service resets its
-    state too; a worker that dies does not.
+    The next event is computed with the initial values. Stopping a service resets its state too; a worker process that
+    ends does not.
     """
     # Of several replicas each has the states of the sources whose events it gets.
     urls = [] if is_url(source) else [state.http for state in states_of(source, replica) if state.http]
@@ -319,14 +340,15 @@ def reset(source: str, event_source: str | None, access_key_file: Path | None, r
 
 
 @command("epypes deploy services/edges_2 --http http://127.0.0.1:8642")
-@click.argument("bundle", type=PATH, help="Folder of the bundle, on the service's machine.")
+@click.argument("bundle", type=PATH, help="Folder of the new bundle, on the machine of the service.")
 @_service_option
 @_state_option
 @access_key_option
 def deploy(bundle: Path, source: str, state: StateChoice | None, access_key_file: Path | None) -> None:
-    """Deploy another bundle to a running service.
+    """Replace the bundle of a running service.
 
-    The service replays the bundle first; if it computes something else, the service keeps the old one.
+    The service replays the samples of the new bundle first. If a token differs, it keeps the old bundle. The change
+    happens between two events.
     """
     with connect_to(source, access_key_file) as connection:
         before = connection.info()
@@ -339,9 +361,9 @@ def deploy(bundle: Path, source: str, state: StateChoice | None, access_key_file
 @_state_option
 @access_key_option
 def rollback(source: str, state: StateChoice | None, access_key_file: Path | None) -> None:
-    """Return a running service to its previous bundle.
+    """Undo the last deploy of a running service.
 
-    A second rollback returns to the bundle before the first.
+    A second rollback undoes the first.
     """
     with connect_to(source, access_key_file) as connection:
         _print_exchange("ROLLED BACK", connection.info(), connection.rollback(state))

@@ -37,8 +37,8 @@ Info = dict[str, Any]
 def status(source: str, as_json: bool, replica: str) -> None:
     """Show the state of a running service.
 
-    The output has its addresses, event counts and parameters, and all replicas that share its events. With --replica
-    it describes one replica.
+    The output has the addresses, the numbers of events and the parameters, and a line for each replica: a service that
+    shares the events of the same broker. With --replica it describes one replica.
     """
     if is_url(source):
         services = [_ask(source)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -13,14 +14,19 @@ UV = [sys.executable, "-m", "uv"]
 
 
 class Environment:
-    """A virtual environment with EPypes and some of its extras, and a folder to run things in."""
+    """A virtual environment with EPypes and some of its extras, and a folder to run things in.
 
-    def __init__(self, home: Path, wheel: Path, extras: str) -> None:
+    What it has ``before`` are requirements that are installed first.
+    """
+
+    def __init__(self, home: Path, wheel: Path, extras: str, before: Sequence[str] = ()) -> None:
         self.bin, self.folder = home / "venv" / "bin", home / "empty"
         self.folder.mkdir()
         named = f"epypes[{extras}]" if extras else "epypes"
         subprocess.run([*UV, "venv", "--quiet", "--python", sys.executable, str(home / "venv")], check=True)
         install = [*UV, "pip", "install", "--quiet", "--python", str(self.bin / "python")]
+        if before:
+            subprocess.run([*install, *before], check=True)
         subprocess.run([*install, f"{named} @ {wheel.as_uri()}"], check=True)
 
     def has(self, *modules: str) -> list[str]:
@@ -45,14 +51,26 @@ class Environment:
 
 
 @pytest.fixture(scope="session")
-def wheel(tmp_path_factory):
-    out = tmp_path_factory.mktemp("wheel")
-    subprocess.run([*UV, "build", "--quiet", "--wheel", "--out-dir", str(out), str(ROOT)], check=True)
-    (found,) = out.glob("*.whl")
+def distributions(tmp_path_factory):
+    """The folder of the source distribution, and of the wheel that was built from it."""
+    out = tmp_path_factory.mktemp("distributions")
+    subprocess.run([*UV, "build", "--quiet", "--out-dir", str(out), str(ROOT)], check=True)
+    return out
+
+
+@pytest.fixture(scope="session")
+def source_distribution(distributions):
+    (found,) = distributions.glob("*.tar.gz")
+    return found
+
+
+@pytest.fixture(scope="session")
+def wheel(distributions):
+    (found,) = distributions.glob("*.whl")
     return found
 
 
 @pytest.fixture
 def environment(wheel, tmp_path_factory):
     """Make an environment with the extras that are named, as ``"serve"`` or ``"widgets,vision"``."""
-    return lambda extras: Environment(tmp_path_factory.mktemp("environment"), wheel, extras)
+    return lambda extras, before=(): Environment(tmp_path_factory.mktemp("environment"), wheel, extras, before)

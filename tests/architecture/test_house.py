@@ -63,11 +63,6 @@ def test_every_public_name_can_be_had_and_all_is_sorted():
         _ = epypes.tune
 
 
-def test_the_version_is_the_packages():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert epypes.__version__ == project["version"]
-
-
 def test_a_module_has_at_most_500_lines_of_code():
     # That each begins with a summary, and that nothing prints, ruff sees to (D, T20).
     long = [path for path in MODULES if path.read_text().count("\n") > 500]

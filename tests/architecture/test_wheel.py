@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import zipfile
+from pathlib import Path
 
+import click
 import pytest
 
 pytestmark = pytest.mark.packaging
+
+HERE = Path(__file__).parent
+TUTORIAL = HERE.parents[1] / "notebooks" / "01_edge_detection.ipynb"
 
 MAIN_JOB = """
 import cv2, numpy as np, epypes as ep
@@ -23,6 +28,19 @@ assert runner["lo"] == 20
 ep.promote(runner, "bundle")
 assert verify("bundle").identical
 print(ep.__file__)
+"""
+
+COLAB = [line for line in (HERE / "colab.txt").read_text().splitlines() if not line.startswith("#")]
+# What the line upgrades; the kernel and all that computes stay as they are.
+UPGRADED = {"click", "ipywidgets", "rich"}
+EXECUTES = """
+import sys, nbclient, nbformat
+from importlib.metadata import version
+notebook = nbformat.read(sys.argv[1], 4)
+nbclient.NotebookClient(notebook, timeout=240, kernel_name="python3").execute()
+outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+print(*sorted({kind for output in outputs for kind in output.get("data", ())}))
+print(*(name for name, _, old in (line.partition("==") for line in sys.argv[2:]) if version(name) != old))
 """
 
 
@@ -42,7 +60,7 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
     ):
         assert name in names
     tops = {name.partition("/")[0] for name in names}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"epypes", "epypes_widgets"}
+    assert {top for top in tops if not top.endswith((".dist-info", ".data"))} == {"epypes", "epypes_widgets"}
 
 
 def test_the_wheel_does_the_main_job_in_a_clean_environment(environment):
@@ -50,6 +68,9 @@ def test_the_wheel_does_the_main_job_in_a_clean_environment(environment):
     assert str(everything.bin.parent) in everything.python(MAIN_JOB)
     done = everything.epypes("verify", "bundle")
     assert done.returncode == 0, done.stderr
+    code = "from jupyter_server.extension.serverextension import main; main(['list'])"
+    listed = click.unstyle(everything.python(code))
+    assert "epypes.jupyter_server_extension enabled" in listed
 
 
 def test_the_core_imports_without_any_extra(environment):
@@ -65,3 +86,11 @@ def test_the_core_imports_without_any_extra(environment):
     assert "pip install 'epypes[graphviz]'" in told
     done = alone.epypes("--help")
     assert done.returncode == 0, done.stderr
+
+
+def test_the_first_tutorial_runs_with_what_colab_has_and_one_line(environment):
+    # %pip install 'epypes[widgets]'
+    colab = environment("widgets", COLAB)
+    kinds, changed = colab.python(EXECUTES, str(TUTORIAL), *COLAB).splitlines()
+    assert {"image/svg+xml", "application/vnd.jupyter.widget-view+json"} <= set(kinds.split())
+    assert set(changed.split()) == UPGRADED

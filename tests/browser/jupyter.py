@@ -25,7 +25,7 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -64,12 +64,14 @@ class JupyterLab:
         An empty folder for its settings, its log and its runtime files.
     theme
         ``"light"`` or ``"dark"``.
-    plain
-        Whether it is started by itself, not by ``epypes lab``.
+    command
+        The module that Python runs, and its first arguments.
     """
 
-    def __init__(self, root: Path, state: Path, theme: str = "light", *, plain: bool = True) -> None:
-        self.root, self.state, self.theme, self.plain = root.resolve(), state, theme, plain
+    def __init__(
+        self, root: Path, state: Path, theme: str = "light", *, command: Sequence[str] = ("jupyterlab",)
+    ) -> None:
+        self.root, self.state, self.theme, self.command = root.resolve(), state, theme, command
         self.port, self.token = _free_port(), secrets.token_hex(16)
         self.log: list[str] = []
         self._listening = threading.Event()
@@ -77,7 +79,7 @@ class JupyterLab:
     def __enter__(self) -> Self:
         self._write_settings()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", *self._command(), *self._arguments()],
+            [sys.executable, "-m", *self.command, *self._arguments()],
             env=self._environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -162,9 +164,6 @@ class JupyterLab:
             "IPYTHONDIR": str(self.state / "ipython"),
             "PYTHONUNBUFFERED": "1",
         }
-
-    def _command(self) -> list[str]:
-        return ["jupyterlab"] if self.plain else ["epypes.cli", "lab", str(self.root), "--"]
 
     def _arguments(self) -> list[str]:
         return [

@@ -218,31 +218,30 @@ def test_of_twenty_values_the_nineteenth_is_the_95th_percentile():
     assert p95([3.0]) == 3
 
 
-def measured_of(ours, image=(), server="epypes lab"):
+def measured_of(ours, image=()):
     image = image or ours
     peers = {OURS: [ours], IMAGE: [image], MATPLOTLIB: [image]}
-    return Measured(server, [10.0, 10.0], peers, peers, slow=ours, slow_runs=3)
+    return Measured([10.0, 10.0], peers, peers, slow=ours, slow_runs=3)
 
 
 def test_the_floor_and_the_peers_of_the_same_page_are_what_a_drag_is_held_to():
     fast, late = seen_of([(0, 1), (1, 2)], [(21, 1), (22, 2)]), seen_of([(0, 1), (1, 2)], [(26, 1), (27, 2)])
     verdicts = {each.work: each.reached for each in compared(measured_of(fast, late))}
-    assert verdicts["epypes lab: a key press, p50, to echo"] is True
-    assert verdicts["epypes lab: a drag of 60 moves, p95, to ipywidgets.Image"] is True
+    assert verdicts["JupyterLab: a key press, p50, to echo"] is True
+    assert verdicts["JupyterLab: a drag of 60 moves, p95, to ipywidgets.Image"] is True
     verdicts = {each.work: each.reached for each in compared(measured_of(late, fast))}
-    assert verdicts["epypes lab: a key press, p50, to echo"] is False
-    assert verdicts["epypes lab: a drag of 60 moves, p95, to ipywidgets.Image"] is False
+    assert verdicts["JupyterLab: a key press, p50, to echo"] is False
+    assert verdicts["JupyterLab: a drag of 60 moves, p95, to ipywidgets.Image"] is False
 
 
-def test_fifty_pictures_are_asked_of_our_websocket_alone():
-    def verdict(count, server):
+def test_fifty_pictures_are_asked_of_a_drag():
+    def verdict(count):
         moves = [(at, at) for at in range(60)]
-        found = compared(measured_of(seen_of(moves, [(at + 1, at) for at in range(60 - count, 60)]), server=server))
+        found = compared(measured_of(seen_of(moves, [(at + 1, at) for at in range(60 - count, 60)])))
         return next(each.reached for each in found if "pictures" in each.work)
 
-    assert verdict(50, "epypes lab") is True
-    assert verdict(49, "epypes lab") is False
-    assert verdict(49, "jupyter lab") is None
+    assert verdict(50) is True
+    assert verdict(49) is False
 
 
 def test_what_is_counted_is_shown_and_kept_as_a_number():
@@ -257,12 +256,11 @@ def test_what_is_counted_is_shown_and_kept_as_a_number():
 
 @pytest.mark.browser
 @pytest.mark.soak
-def test_a_quick_run_moves_the_sliders_of_both_servers_and_keeps_every_row(tmp_path):
+def test_a_quick_run_moves_the_sliders_and_keeps_every_row(tmp_path):
     rows = apart(lambda: tuning.rows(QUICK))
     write_json(rows, [], tmp_path / "benchmarks.json")
     kept = json.loads((tmp_path / "benchmarks.json").read_text())["rows"]
-    servers = [each["work"].partition(":")[0] for each in kept]
-    assert servers == ["jupyter lab"] * 9 + ["epypes lab"] * 9
+    assert len({each["work"] for each in kept}) == len(kept) == 10
     for each in kept:
         amounts = each.get("medians_ns") or each["medians_count"]
         assert all(0 < amount < math.inf for amount in amounts.values()), each

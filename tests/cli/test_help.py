@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import subprocess
 import sys
+from importlib import metadata
+from pathlib import Path
 
 import click
 import pytest
@@ -131,10 +134,36 @@ def test_every_help_has_an_example_that_its_command_takes(words, epypes):
             found.make_context("epypes", given)
 
 
+def complete(words, tmp_path):
+    """Return what bash offers for the last word of a command line."""
+    script = 'source <(epypes completion bash); _epypes_completion epypes; printf "%s\\n" "${COMPREPLY[@]}"'
+    line = f"COMP_WORDS=({' '.join(map(repr, words))}); COMP_CWORD={len(words) - 1}; {script}"
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stderr == ""
+    return set(done.stdout.split())
+
+
+@pytest.mark.slow
+def test_bash_completes_commands_options_and_choices(tmp_path):
+    assert complete(["epypes", "se"], tmp_path) == {"serve", "set"}
+    assert complete(["epypes", "serve", "edges", "--job"], tmp_path) == {"--job-timeout"}
+    assert complete(["epypes", "serve", "edges", "--state-per", ""], tmp_path) == {"one", "source"}
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_shell_gets_a_script_that_asks_epypes(shell, epypes):
+    assert f"_EPYPES_COMPLETE={shell}_complete" in epypes("completion", shell).stdout
+
+
 @pytest.mark.parametrize("words", [[], ["serve"], ["export"], ["export", "docker"]], ids=" ".join)
 def test_h_is_help(epypes, words):
     assert epypes(*words, "-h").stdout == epypes(*words, "--help").stdout
 
 
 def test_version_is_that_of_the_package(epypes):
-    assert epypes("--version").stdout.split() == ["epypes", ep.__version__]
+    module = subprocess.run([sys.executable, "-m", "epypes", "--version"], capture_output=True, text=True, check=True)
+    assert epypes("--version").stdout.split() == module.stdout.split() == ["epypes", ep.__version__]
+    assert ep.__version__ == metadata.version("epypes")

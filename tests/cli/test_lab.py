@@ -1,4 +1,4 @@
-"""``epypes lab`` starts JupyterLab, whose kernel websocket sends at once."""
+"""``epypes lab`` starts JupyterLab; the kernel websocket of every JupyterLab sends at once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import time
 
 import pytest
 
-from epypes.cli.lab import _load_jupyter_server_extension, lab_command
+from epypes.cli.lab import lab_command
+from epypes.jupyter_server_extension import _load_jupyter_server_extension
 from tests.apart import apart
 from tests.browser.jupyter import JupyterLab
 
@@ -74,10 +75,10 @@ async def nodelay_of(lab):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plain", [False, True], ids=["epypes lab", "jupyter lab"])
-def test_a_kernels_websocket_sends_at_once(plain, state, tmp_path):
-    with JupyterLab(tmp_path, state, plain=plain) as lab:
-        assert apart(lambda: asyncio.run(nodelay_of(lab))) is not plain
+@pytest.mark.parametrize("command", [("jupyterlab",), ("epypes", "lab", ".", "--")], ids=" ".join)
+def test_a_kernels_websocket_sends_at_once(command, state, tmp_path):
+    with JupyterLab(tmp_path, state, command=command) as lab:
+        assert apart(lambda: asyncio.run(nodelay_of(lab)))
 
 
 @pytest.mark.slow

@@ -23,5 +23,4 @@ def rows(effort: Effort) -> list[Row]:
 
     if missing():
         return []
-    sliders = [row for plain in (True, False) for row in compared(measured(effort, plain=plain))]
-    return sliders + hover.rows(effort)
+    return [*compared(measured(effort)), hover.row(effort)]

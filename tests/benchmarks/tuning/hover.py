@@ -31,23 +31,20 @@ _HOVERED = """token => new Promise(resolve => {
 })"""
 
 
-def rows(effort: Effort) -> list[Row]:
-    """Return a row for each way to start JupyterLab; the first hover, which opens the connection, is one of many."""
-    return [_row(effort, plain=plain) for plain in (True, False)]
-
-
-def _row(effort: Effort, *, plain: bool) -> Row:
+def row(effort: Effort) -> Row:
+    """Return the row of all hovers; the first one, which opens the connection, is one of many."""
     count = _QUICK_TOKENS if effort.quick else _TOKENS
     with tempfile.TemporaryDirectory(prefix="epypes-hover-") as folder:
         notebooks = Path(folder) / "notebooks"
         notebooks.mkdir()
         write_notebook(notebooks / "hover.ipynb", _CELL.format(count=count))
-        with JupyterLab(notebooks, Path(folder) / "lab", plain=plain) as lab, chromium() as browser:
+        with JupyterLab(notebooks, Path(folder) / "lab") as lab, chromium() as browser:
             notebook = Notebook(open_lab(browser, lab), "hover.ipynb")
             notebook.run_all()
             echoes = notebook.echo_ms(count)
             hovers = [notebook.page.evaluate(_HOVERED, f"t{index}") for index in range(1, count)]
     amounts = {"echo": median(echoes) * 1e6, OURS: median(hovers) * 1e6}
-    server = "jupyter lab" if plain else "epypes lab"
     note = f"limit: an empty request to the kernel and back; the slowest hover took {max(hovers):.0f} ms"
-    return Row(f"{server}: hover to full picture, 1 MP", amounts, goal=Goal("total", _MOST_NS), limit="echo", note=note)
+    return Row(
+        "JupyterLab: hover to full picture, 1 MP", amounts, goal=Goal("total", _MOST_NS), limit="echo", note=note
+    )

@@ -27,12 +27,10 @@ _ECHOES, _PRESSES = 20, 10
 
 @dataclass(frozen=True)
 class Measured:
-    """What one server's page saw, round after round.
+    """What the page saw, round after round.
 
     Attributes
     ----------
-    server
-        How JupyterLab was started.
     echoes_ms
         Of an integer through the kernel and back.
     presses, drags
@@ -41,7 +39,6 @@ class Measured:
         The drag over a function of half a second, and how often that function was run.
     """
 
-    server: str
     echoes_ms: Sequence[float]
     presses: Mapping[str, Sequence[Seen]]
     drags: Mapping[str, Sequence[Seen]]
@@ -49,23 +46,21 @@ class Measured:
     slow_runs: int
 
 
-def measured(effort: Effort, *, plain: bool) -> Measured:
-    """Start a JupyterLab, by itself or by ``epypes lab``, open the notebook and move its sliders."""
+def measured(effort: Effort) -> Measured:
+    """Start JupyterLab, open the notebook and move its sliders."""
     with tempfile.TemporaryDirectory(prefix="epypes-tuning-") as folder:
         notebooks = Path(folder) / "notebooks"
         notebooks.mkdir()
         cells.write_notebook(notebooks / "tuning.ipynb")
-        with JupyterLab(notebooks, Path(folder) / "lab", plain=plain) as lab, chromium() as browser:
+        with JupyterLab(notebooks, Path(folder) / "lab") as lab, chromium() as browser:
             notebook = Notebook(open_lab(browser, lab), "tuning.ipynb")
             notebook.run_all()
-            found = _moved(
-                notebook, _QUICK_ROUNDS if effort.quick else _ROUNDS, "jupyter lab" if plain else "epypes lab"
-            )
+            found = _moved(notebook, _QUICK_ROUNDS if effort.quick else _ROUNDS)
             assert not notebook.page_errors, notebook.page_errors
             return found
 
 
-def _moved(notebook: Notebook, rounds: int, server: str) -> Measured:
+def _moved(notebook: Notebook, rounds: int) -> Measured:
     begin(notebook)
     sliders = {
         OURS: Slider(notebook, cells.OURS, "canny_lo", "panel"),
@@ -81,7 +76,7 @@ def _moved(notebook: Notebook, rounds: int, server: str) -> Measured:
             presses[name].append(slider.press(key, _PRESSES))
             drags[name].append(slider.drag(MOVES, step_px))
     slow, runs = _slow(notebook)
-    return Measured(server, echoes, presses, drags, slow, runs)
+    return Measured(echoes, presses, drags, slow, runs)
 
 
 def _slow(notebook: Notebook) -> tuple[Seen, int]:
