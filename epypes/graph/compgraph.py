@@ -297,7 +297,7 @@ class CompGraph(OldNames):
 
     def __repr__(self) -> str:
         count = len(self._functions)
-        start = f"<CompGraph: {counted(count, 'function')}, {len(self._tokens)} tokens; "
+        start = f"<CompGraph: {counted(count, 'function')}, {counted(len(self._tokens), 'token')}; "
         end = _redefined_text(self) + ">"
         width = min(18, (95 - len(start) - len(end)) // 2)
         return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
@@ -327,7 +327,10 @@ def _read_functions(functions: Iterable[Any], types: bool) -> GraphParts:
 def _declaration(function: Any, taken: Container[str]) -> inspect.Signature | Finding:
     """Return the signature of a function that has one and a name that is not taken, else what is wrong with it."""
     if not callable(function):
-        text = f"{function!r:.60} is {type(function).__name__}, which can't be called. Give functions, one by one."
+        kind = type(function).__name__
+        text = f"A graph is made of functions, not of {kind!r}. Give the function itself: edges, not edges(image)."
+        if isinstance(function, list | tuple) and all(map(callable, function)):
+            text = f"Give functions one by one, not as a {kind}: CompGraph.from_functions(*functions)."
         return Finding("not callable", text, ())
     name = getattr(function, "__name__", None)
     if not isinstance(name, str) or not name.isidentifier():

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
 
-from epypes.errors import RecordingError
+from epypes.errors import InvalidValue, RecordingError
 from epypes.optional import optional_import
 from epypes.transport.channel import Frames
 
@@ -258,10 +258,10 @@ def _unpacked(data: bytes) -> list[memoryview]:
         start = place + _LENGTH.size
         place = start + int.from_bytes(view[place:start], "little")
         if place > len(view):
-            raise ValueError("a frame is longer than its message")
+            raise InvalidValue("a frame is longer than its message")
         frames.append(view[start:place])
     if not frames or place != len(view):
-        raise ValueError("the frames are not the whole message")
+        raise InvalidValue("the frames are not the whole message")
     return frames
 
 
