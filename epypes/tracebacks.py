@@ -8,6 +8,7 @@ An error of EPypes says in its text what a library has said, so the library's ow
 
 from __future__ import annotations
 
+import functools
 import sys
 from types import FrameType, TracebackType
 from typing import Any, Final
@@ -40,8 +41,8 @@ def render(error: BaseException | None = None, *, is_own: bool = False) -> list[
     error
         The exception; without, the one that is being handled, or was handled last.
     is_own
-        Whether EPypes has raised it: every frame of EPypes at its end is left out, not only the hidden ones, and its
-        cause, if only EPypes and libraries were running then.
+        Whether EPypes has raised it: every frame after the user's last one is left out, not only the hidden ones, and
+        its cause, if only EPypes and libraries were running then.
     """
     shown: Any = error or sys.exc_info()[1] or sys.last_value
     shell: Any = sys.modules["IPython"].get_ipython()
@@ -65,7 +66,7 @@ def _without_end(traceback: TracebackType | None, is_own: bool) -> TracebackType
     while traceback is not None:
         parts.append(traceback)
         traceback = traceback.tb_next
-    while parts and (is_hidden(parts[-1].tb_frame) or (is_own and _is_own(parts[-1].tb_frame))):
+    while parts and (is_hidden(parts[-1].tb_frame) or (is_own and not _is_users(parts[-1].tb_frame))):
         parts.pop()
     made = None
     for part in reversed(parts):
@@ -74,18 +75,23 @@ def _without_end(traceback: TracebackType | None, is_own: bool) -> TracebackType
 
 
 def _has_users_frame(traceback: TracebackType | None) -> bool:
-    """Whether a traceback has a frame that is neither one of EPypes nor of an installed package."""
-    import sysconfig  # not before something has failed
-
-    paths = sysconfig.get_paths()
-    installed = (*(paths[kind] for kind in ("stdlib", "platstdlib", "purelib", "platlib")), "<frozen", "<string>")
     while traceback is not None:
-        frame = traceback.tb_frame
-        if not _is_own(frame) and not frame.f_code.co_filename.startswith(installed):
+        if _is_users(traceback.tb_frame):
             return True
         traceback = traceback.tb_next
     return False
 
 
-def _is_own(frame: FrameType) -> bool:
-    return str(frame.f_globals.get("__name__")).partition(".")[0] in _OWN
+def _is_users(frame: FrameType) -> bool:
+    """Whether a frame is neither one of EPypes nor of an installed package."""
+    is_own = str(frame.f_globals.get("__name__")).partition(".")[0] in _OWN
+    return not is_own and not frame.f_code.co_filename.startswith(_installed())
+
+
+@functools.cache
+def _installed() -> tuple[str, ...]:
+    """Return what the file names of installed packages, and of Python's own modules, begin with."""
+    import sysconfig  # not before something has failed
+
+    paths = sysconfig.get_paths()
+    return (*(paths[kind] for kind in ("stdlib", "platstdlib", "purelib", "platlib")), "<frozen")

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+from importlib import metadata
+from pathlib import Path
 
 import pytest
 
+from epypes.errors import MissingPackage
 from tests.ipython_cells import run_cells
 
+ROOT = Path(__file__).parents[2]
 SETUP = """
 import cv2
 import numpy as np
@@ -91,6 +95,13 @@ MISTAKES = {
         "A generator can be read only once: make a list of it."
     ),
     "ep.sweep(runner, {'canny_lo': []})": "canny_lo=[] has no values. Give at least one, as canny_lo=[...].",
+    "ep.CompGraphRunner(cg, canny_lo=3)": "unexpected keyword argument 'canny_lo'",
+    "def hue(image):\n    return cv2.cvtColor(image, cv2.COLOR_RGB2HSV)\nrun_once(gray, hue)": (
+        "annotate what the function takes: Annotated[np.ndarray, ep.Image(order='bgr')]."
+    ),
+    "import sys; sys.modules['optuna'] = None; ep.optimize(runner, 'edges', [image])": (
+        "Package 'optuna' is missing. Run: pip install 'epypes[scale]'"
+    ),
     "ep.connect('http://127.0.0.1:9')": "No service answers at http://127.0.0.1:9. Start one: epypes serve",
 }
 
@@ -108,3 +119,11 @@ def test_the_error_names_the_way_out_below_the_users_own_line(shown, cell):
     assert not shown[cell].succeeded
     assert MISTAKES[cell] in " ".join(shown[cell].text.split()), shown[cell].text
     assert not re.search(r"File \S*epypes", shown[cell].text)
+
+
+def test_where_epypes_runs_from_a_folder_the_command_for_a_missing_package_names_that(monkeypatch):
+    def none(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", none)
+    assert str(MissingPackage("optuna", "scale")) == f"Package 'optuna' is missing. Run: pip install '{ROOT}[scale]'"
