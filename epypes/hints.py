@@ -119,7 +119,7 @@ class Param:
             raise InvalidValue(f"soft begins at {soft_low}, above its end at {soft_high}. Exchange them.")
         if (self.low is not None and soft_low < self.low) or (self.high is not None and soft_high > self.high):
             raise InvalidValue(
-                f"soft ({soft_low} to {soft_high}) reaches beyond low or high. Narrow it, or widen them."
+                f"soft ({soft_low} to {soft_high}) reaches beyond low or high. Narrow it, or widen those."
             )
 
     def allows(self, value: Any) -> bool:

@@ -26,7 +26,7 @@ _MOST_ITEMS: Final = 1_000
 # What functions say that have got None for an image: Python's own operations, and those of OpenCV.
 _OF_NONE: Final = re.compile(r"None|\bempty\b|OpenCV\(")
 # What OpenCV and Python say that have got a path for an image.
-_OF_TEXT: Final = re.compile(r"OpenCV\(|'str' object|PosixPath")
+_OF_TEXT: Final = re.compile(r"not a numpy array|(str|Path)' object has no attribute")
 _WAS_IT_FOUND: Final = "Was the file found? cv2.imread returns None for a file that it can't read."
 _DOES_IT_RETURN: Final = (
     "Does it return a value? One that has found nothing can return ep.Nothing: what takes that is skipped."

@@ -468,7 +468,7 @@ def interact(functions: Any, /, *payload: Any, **abbreviations: Any) -> Panel:
     ------
     GraphError, TypeError, ValueError, UnknownName, PayloadError
         The functions can't be tuned, such as a lambda or one with ``*args``; a parameter has no value; a keyword is for
-        no parameter; the image is None. Each says the way out.
+        no parameter; the image is None, or what the functions return. Each says the way out.
     Exception
         Whatever a function raises on the first run.
 
