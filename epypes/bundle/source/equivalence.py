@@ -52,7 +52,6 @@ from epypes.bundle.source.resolve import (
     spelled_tree,
     statements_of_class,
 )
-from epypes.errors import InvalidType
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
 
@@ -218,7 +217,7 @@ class _Walk:
         try:
             is_installed_module = isinstance(ours, types.ModuleType) and is_installed(ours.__name__)
             if is_installed_module or isinstance(ours, CompGraphRunner):
-                raise InvalidType("what a module holds, and a runner's last run, is no part of its description")
+                raise TypeError("what a module holds, and a runner's last run, is no part of its description")
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
             text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."

@@ -23,7 +23,6 @@ from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 from epypes.bundle.source.resolve import Importable, Refused, importable
-from epypes.errors import InvalidValue
 from epypes.nothing import Nothing
 from epypes.run.guard import is_plain_array
 
@@ -108,7 +107,7 @@ def literal(value: Any) -> str:
     if type(value) in (tuple, list, dict) or (type(value) is set and value):
         return bracketed(value, literal)
     if not is_data(value):  # a kind of str or int inside a tuple would become a plain one
-        raise InvalidValue(f"an object of class {type(value).__name__!r} has no literal")
+        raise ValueError(f"an object of class {type(value).__name__!r} has no literal")
     return repr(value)
 
 
@@ -224,7 +223,7 @@ class _Writer:
             return f"{self.write(made_by)}({self._joined(arguments)})"
         made = self._array(value) if is_plain_array(value) else self._record(value) or self._object(value)
         if not made:
-            raise InvalidValue(f"no expression makes an object of class {type(value).__name__!r}")
+            raise ValueError(f"no expression makes an object of class {type(value).__name__!r}")
         return made
 
     def _joined(self, values: Iterable[Any]) -> str:
