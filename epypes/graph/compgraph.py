@@ -9,7 +9,7 @@ from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.deprecation import OldNames, takes_old_keywords
-from epypes.errors import Finding, GraphError, UnknownName, require_mapping
+from epypes.errors import Finding, GraphError, InvalidType, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.colours import ColourOrder, find_orders
 from epypes.graph.identity import is_redefined_inside, redefined
@@ -70,6 +70,9 @@ class CompGraph(OldNames):
     """
 
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
+        if callable(func_dict):
+            text = "func_dict must be a mapping by function name, not a function."
+            raise InvalidType(f"{text} Of functions alone: CompGraph.from_functions(function, ...).")
         for what, given in (("func_dict", func_dict), ("func_io", func_io)):
             require_mapping(what, given, "by function name")
         self._build(GraphParts(dict(func_dict), dict(func_io), types=types))

@@ -56,6 +56,7 @@ MISTAKES = {
     ),
     "ep.CompGraph.from_functions(gray(image))": "Give the function itself: edges, not edges(image).",
     "ep.CompGraph.from_functions(gray, edges, gray)": "Two functions are called 'gray'. Rename one of them",
+    "ep.CompGraph(gray, edges)": "Of functions alone: CompGraph.from_functions(function, ...).",
     "ep.CompGraph({'gray': gray}, {'gray': (('image', 'k'), 'g')})": (
         "Function 'gray' takes 1 input (image), but its io names 2: (image, k)."
     ),
