@@ -229,8 +229,13 @@ def __getattr__(name: str) -> Any:
         return globals().setdefault(name, version("epypes"))
     home = _HOMES.get(name)
     if home is None:
-        way_out = ": from epypes_widgets import tune" if name == "tune" else ""
-        raise AttributeError(f"module 'epypes' has no attribute {name!r}{way_out}")
+        from epypes.errors import UnknownAttribute, nearest
+
+        near = nearest(name, __all__)
+        way_out = f" Did you mean {near!r}?" if near else ""
+        if name in ("interact", "pick", "tune"):
+            way_out = f" Write: from epypes_widgets import {name}"
+        raise UnknownAttribute(f"Module 'epypes' has no attribute {name!r}.{way_out}")
     from epypes.optional import optional_import
 
     with optional_import():

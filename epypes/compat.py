@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from epypes.deprecation import describe, old_names
+from epypes.errors import InvalidValue
 from epypes.graph import CompGraph, extend, rename, union
 from epypes.optional import optional_import
 from epypes.pipeline import EventLoop, Mailbox, Node, NodeBasedCompGraph, Pipeline, SinkPipeline, wait
@@ -137,7 +138,7 @@ def _queue_putter(func: Callable[[Any], Any], q_out: Any) -> Callable[[Any], Non
 def _subscriber(server_address: str, q: Any, sub_prefix: str = "") -> Any:
     if sub_prefix:
         new = "ep.ZMQSubscriber(address, queue), and look at the first bytes of each message in f_in"
-        raise ValueError(describe("sub_prefix=", new))
+        raise InvalidValue(describe("sub_prefix=", new))
     with optional_import():
         from epypes.transport import ZMQSubscriber
     return ZMQSubscriber(server_address, q)

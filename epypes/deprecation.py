@@ -13,6 +13,8 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeVar
 
+from epypes.tracebacks import fold_end
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 # New names of parameters by old ones.
@@ -65,7 +67,11 @@ def takes_old_keywords(function: F) -> F:
         __tracebackhide__ = True
         if kwargs and not _OLD.isdisjoint(kwargs):
             kwargs = _renamed(kwargs)
-        return function(*args, **kwargs)
+        try:
+            return function(*args, **kwargs)
+        except TypeError as error:  # that there is no such parameter has this frame for its last
+            fold_end(error)
+            raise
 
     return wrapper  # type: ignore[return-value]
 

@@ -3,6 +3,9 @@
 Everything an error's text mentions is an attribute of it::
 
     EpypesError
+    +-- InvalidValue            an argument has a value that can't be used; also a ValueError
+    +-- InvalidType             an argument is of another type than it must be; also a TypeError
+    +-- UnknownAttribute        a module or an object has no such attribute; also an AttributeError
     +-- GraphError              a graph can't be built; .findings lists every problem
     +-- UnknownName             no such token, function, output ...; .name, .known
     +-- NotComputed             a token has no value yet; .token
@@ -74,6 +77,18 @@ class EpypesError(Exception):
     def _render_traceback_(self) -> list[str]:
         """Return the lines that IPython shows: they end at the user's own line."""
         return render(self, is_own=True)
+
+
+class InvalidValue(EpypesError, ValueError):
+    """An argument has a value that can't be used."""
+
+
+class InvalidType(EpypesError, TypeError):
+    """An argument is of another type than it must be."""
+
+
+class UnknownAttribute(EpypesError, AttributeError):
+    """A module or an object has no such attribute."""
 
 
 class _PathError(EpypesError):
@@ -156,7 +171,7 @@ class StaleToken(NotComputed):
 def require_mapping(what: str, given: object, of: str) -> None:
     """Raise TypeError unless this is a mapping; ``of`` says of what, as ``"by function name"``."""
     if not isinstance(given, Mapping):
-        raise TypeError(f"{what} must be a mapping {of}, such as a dict, not {type(given).__name__!r}.")
+        raise InvalidType(f"{what} must be a mapping {of}, such as a dict, not {type(given).__name__!r}.")
 
 
 def run_call(tokens: Iterable[str]) -> str:
@@ -289,12 +304,30 @@ class MailboxOverflow(EpypesError):
         super().__init__(f"The mailbox is full ({size}) and its policy is 'fault'. Take faster, or drop.")
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs what an extra brings, beside the EPypes that is here.
+
+    Where EPypes is installed, pip and uv leave it and add what is missing. Where it runs from a folder with its source
+    and is not installed, they would fetch another version: then the command names the folder.
+    """
+    from importlib import metadata
+    from pathlib import Path
+
+    source = Path(__file__).parents[1]
+    try:
+        metadata.distribution("epypes")
+    except metadata.PackageNotFoundError:
+        if (source / "pyproject.toml").exists():
+            return f"pip install '{source}[{extra}]'"
+    return f"pip install 'epypes[{extra}]'"
+
+
 class MissingPackage(EpypesError, ModuleNotFoundError):
     """A package is not installed; ``extra`` names the extra of EPypes that brings it."""
 
     def __init__(self, package: str, extra: str, module: str | None = None) -> None:
         self.package, self.extra = package, extra
-        super().__init__(f"Package {package!r} is missing. Run: pip install 'epypes[{extra}]'", name=module)
+        super().__init__(f"Package {package!r} is missing. Run: {install_command(extra)}", name=module)
 
 
 class SourceRefused(EpypesError):
@@ -312,7 +345,7 @@ class LayoutUnavailable(EpypesError):
         self.tried = tuple(tried)
         super().__init__(
             "No Graphviz engine answered, so the graph is not drawn. "
-            f"Run: pip install 'epypes[graphviz]'. Tried: {'; '.join(self.tried)}."
+            f"Run: {install_command('graphviz')}. Tried: {'; '.join(self.tried)}."
         )
 
 

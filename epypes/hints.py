@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
 
+from epypes.errors import InvalidValue
+
 
 @dataclass(frozen=True, slots=True)
 class Param:
@@ -73,13 +75,13 @@ class Param:
         self._check_choices()
         self._check_soft()
         if self.low is not None and self.high is not None and self.low > self.high:
-            raise ValueError(f"low ({self.low}) is above high ({self.high}). Exchange them.")
+            raise InvalidValue(f"low ({self.low}) is above high ({self.high}). Exchange them.")
         if self.step is not None and self.step <= 0:
-            raise ValueError(f"step must be positive, not {self.step}.")
+            raise InvalidValue(f"step must be positive, not {self.step}.")
         if self.log and (self.low is None or self.low <= 0):
-            raise ValueError("A logarithmic range needs a positive low.")
+            raise InvalidValue("A logarithmic range needs a positive low.")
         if self.odd and self.low is not None and self.low == self.high and self.low % 2 != 1:
-            raise ValueError(f"There is no odd value between {self.low} and {self.high}.")
+            raise InvalidValue(f"There is no odd value between {self.low} and {self.high}.")
 
     def _check_numbers(self) -> None:
         for setting in ("low", "high", "step"):
@@ -87,36 +89,38 @@ class Param:
             if value is None or self.choices is not None:
                 continue
             if not isinstance(value, numbers.Real) or not _is_end(value, is_step=setting == "step"):
-                raise ValueError(f"{setting} must be a number that a float can hold, not {value!r:.60}.")
+                raise InvalidValue(f"{setting} must be a number that a float can hold, not {value!r:.60}.")
         for setting in ("unit", "below", "cuts", "about"):
             if not isinstance(getattr(self, setting), str):
-                raise ValueError(f"{setting} is a text, not {getattr(self, setting)!r:.60}.")
+                raise InvalidValue(f"{setting} is a text, not {getattr(self, setting)!r:.60}.")
 
     def _check_choices(self) -> None:
         if self.choices is None:
             if self.labels is not None:
-                raise ValueError("labels name choices, and there are none. Give choices too, or leave labels out.")
+                raise InvalidValue("labels name choices, and there are none. Give choices too, or leave labels out.")
             return
         object.__setattr__(self, "choices", tuple(self.choices))
         if not self.choices:
-            raise ValueError("choices is empty. Name at least one value.")
+            raise InvalidValue("There are no choices. Give at least one value.")
         if self.labels is not None:
             object.__setattr__(self, "labels", tuple(self.labels))
             if len(self.labels) != len(self.choices):
                 told = f"labels has {len(self.labels)} names, and there are {len(self.choices)} choices."
-                raise ValueError(f"{told} Name each choice once.")
+                raise InvalidValue(f"{told} Name each choice once.")
         for setting in ("below", "cuts"):
             if getattr(self, setting):
-                raise ValueError(f"{setting} is for a range, and this hint has choices. Leave one of them out.")
+                raise InvalidValue(f"{setting} is for a range, and this hint has choices. Leave one of them out.")
 
     def _check_soft(self) -> None:
         if self.soft is None:
             return
         soft_low, soft_high = self.soft
         if soft_low > soft_high:
-            raise ValueError(f"soft begins at {soft_low}, above its end at {soft_high}. Exchange them.")
+            raise InvalidValue(f"soft begins at {soft_low}, above its end at {soft_high}. Exchange them.")
         if (self.low is not None and soft_low < self.low) or (self.high is not None and soft_high > self.high):
-            raise ValueError(f"soft ({soft_low} to {soft_high}) reaches beyond low or high. Narrow it, or widen these.")
+            raise InvalidValue(
+                f"soft ({soft_low} to {soft_high}) reaches beyond low or high. Narrow it, or widen those."
+            )
 
     def allows(self, value: Any) -> bool:
         """Whether a value is within the hint."""
@@ -206,7 +210,7 @@ def odd_step(step: float | None) -> int:
 
 
 def as_param(hint: Any) -> Param | Roi | None:
-    """Read a hint: a Param or Roi, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
+    """Read a hint: a Param or Roi, a tuple as a range (low, high[, step]), a list or ``range`` as choices; else None.
 
     A dict has choices by their labels.
 
@@ -221,7 +225,7 @@ def as_param(hint: Any) -> Param | Roi | None:
         return hint
     if isinstance(hint, tuple) and len(hint) in (2, 3) and all(isinstance(end, numbers.Real) for end in hint):
         return Param(*hint)
-    if isinstance(hint, list):
+    if isinstance(hint, list | range):
         return Param(choices=tuple(hint))
     if isinstance(hint, dict):
         return Param(choices=tuple(hint.values()), labels=tuple(map(str, hint)))

@@ -13,6 +13,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from epypes.errors import InvalidValue
+
 Order = Literal["bgr", "rgb"]
 
 ORDERS: Final[tuple[Order, ...]] = ("bgr", "rgb")
@@ -70,10 +72,10 @@ class Image:
         if self.range is not None:
             object.__setattr__(self, "range", _checked_range(self.range))
         if self.order is not None and self.order not in ORDERS:
-            raise ValueError(_unknown("order", self.order, ORDERS))
+            raise InvalidValue(_unknown("order", self.order, ORDERS))
         if self.order is not None and self.shape is not None and not _has_colours(self.shape):
             axes = _shape_text(self.shape)
-            raise ValueError(f"An image of shape {axes} has no order {self.order!r}. Leave it out, or add 3 channels.")
+            raise InvalidValue(f"An image of shape {axes} has no order {self.order!r}. Leave it out, or add channels.")
 
     def found(self, value: Any) -> str | None:
         """Return what a value is, in a few words, if it breaks the contract; None if it keeps it."""
@@ -154,14 +156,14 @@ def _dtype_name(dtype: Any) -> str:
     else:
         name = str(getattr(dtype, "name", dtype))
     if name not in _DTYPES:
-        raise ValueError(_unknown("dtype", name, _DTYPES))
+        raise InvalidValue(_unknown("dtype", name, _DTYPES))
     return name
 
 
 def _checked_shape(shape: Any) -> tuple[int | str | None, ...]:
     good = isinstance(shape, tuple | list) and len(shape) > 0
     if not good or not all(_is_axis(side) for side in shape):
-        raise ValueError(f"shape must be a tuple such as (None, None, 3), not {shape!r}. Write None for any length.")
+        raise InvalidValue(f"shape must be a tuple such as (None, None, 3), not {shape!r}. Write None for any length.")
     return tuple(shape)
 
 
@@ -172,10 +174,10 @@ def _is_axis(side: Any) -> bool:
 def _checked_range(ends: Any) -> tuple[float, float]:
     good = isinstance(ends, tuple | list) and len(ends) == 2
     if not good or not all(isinstance(end, int | float) for end in ends):
-        raise ValueError(f"range must be (low, high), not {ends!r}.")
+        raise InvalidValue(f"range must be (low, high), not {ends!r}.")
     low, high = ends
     if not low <= high:
-        raise ValueError(f"The range from {low} to {high} is empty. Give the lower end first.")
+        raise InvalidValue(f"The range from {low} to {high} is empty. Give the lower end first.")
     return low, high
 
 

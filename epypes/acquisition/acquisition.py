@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, Self
 
 from epypes.acquisition.cameras import Camera, camera, has_twins
 from epypes.acquisition.frames import Frame, Ring, frame_image
-from epypes.errors import CameraUnavailable, StillRunning
+from epypes.errors import CameraUnavailable, InvalidValue, StillRunning
 
 State = Literal["stopped", "running", "ended", "failed"]
 
@@ -100,11 +100,11 @@ class ImageAcquisition:
         on_error: Callable[[int, BaseException], object] | None = None,
     ) -> None:
         if not cameras:
-            raise ValueError("Give one camera or more, such as a path, a folder or the number of a device.")
+            raise InvalidValue("Give one camera or more, such as a path, a folder or the number of a device.")
         if has_twins(cameras):
-            raise ValueError("One camera is given twice, but only one thread can read it. Give each its own.")
+            raise InvalidValue("One camera is given twice, but only one thread can read it. Give each its own.")
         if not max_age_s > 0:
-            raise ValueError(f"max_age_s must be above 0, or math.inf, not {max_age_s!r:.40}.")
+            raise InvalidValue(f"max_age_s must be above 0, or math.inf, not {max_age_s!r:.40}.")
         self.max_age_s = max_age_s
         self._lock = threading.Lock()
         self._changed = threading.Condition()

@@ -16,7 +16,7 @@ from typing import Any, Final, Protocol, TypeVar, cast, runtime_checkable
 from epypes.acquisition.files import image_files, is_image_file, quiet_opencv, read_image
 from epypes.acquisition.frames import Frame, frame_image
 from epypes.acquisition.video import Video
-from epypes.errors import CameraUnavailable, ImageFileError
+from epypes.errors import CameraUnavailable, ImageFileError, InvalidType, InvalidValue
 from epypes.optional import optional_import
 from epypes.run.guard import is_array
 
@@ -101,14 +101,14 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
     (4, 6)
     """
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, Real) or not fps > 0):
-        raise ValueError(f"fps must be a number above 0, or None for the source's own pace, not {fps!r:.40}.")
+        raise InvalidValue(f"fps must be a number above 0, or None for the source's own pace, not {fps!r:.40}.")
     if isinstance(source, str) and "://" in source:
         return _of_capture(source, fps, loop)
     if isinstance(source, str | Path):
         return _of_path(Path(source), fps, loop)
     if isinstance(source, Integral) and not isinstance(source, bool):
         if not 0 <= int(source) <= LAST_DEVICE:
-            raise ValueError(f"No camera has the number {source}. They go from 0 to {LAST_DEVICE}.")
+            raise InvalidValue(f"No camera has the number {source}. They go from 0 to {LAST_DEVICE}.")
         return _of_capture(int(source), fps, loop)
     if is_array(source):
         return _still_camera(source, fps, loop)
@@ -120,7 +120,7 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
         return _of_iterable(source, fps, loop)
     if callable(source):
         return _of_function(source, fps, loop)
-    raise TypeError(
+    raise InvalidType(
         f"A camera can't be made of {type(source).__name__!r}. Give a path, an array, the number of a device, a "
         "cv2.VideoCapture, an iterable of arrays, or an object with read() and close()."
     )
@@ -214,7 +214,7 @@ def _of_function(source: Callable[[], Any], fps: float | None, loop: bool) -> It
         return _of_capture(made, fps, loop, source)
     if not isinstance(made, Iterable) or is_array(made):
         name = getattr(source, "__qualname__", "The function")
-        raise TypeError(
+        raise InvalidType(
             f"{name} returned {type(made).__name__!r}, which a camera can't be made of. "
             "Return an iterator of arrays or a cv2.VideoCapture; a generator function does the former."
         )
@@ -280,7 +280,7 @@ class SequenceCamera:
 
 def _image(item: Any) -> Any:
     if item is None:
-        raise TypeError("The iterator gave None, which is no image. Let it end, or wait inside it for the next one.")
+        raise InvalidType("The iterator gave None, which is no image. Let it end, or wait inside it for the next one.")
     return item.image if isinstance(item, Frame) else item
 
 

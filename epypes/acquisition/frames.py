@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from sys import getrefcount
 from typing import Any, Final
 
-from epypes.errors import FrameUnavailable
+from epypes.errors import FrameUnavailable, InvalidType, InvalidValue
 from epypes.graph import CompGraph, colour_order
 from epypes.images import in_order
 
@@ -77,7 +77,7 @@ class Ring:
 
     def __init__(self, size: int = 8, *, name: str = "The camera") -> None:
         if operator.index(size) < 1:
-            raise ValueError(f"A ring can't keep {size} frames. Give a size of 1 or more.")
+            raise InvalidValue(f"A ring can't keep {size} frames. Give a size of 1 or more.")
         self.size, self.name = operator.index(size), name
         self._frames: deque[Frame] = deque(maxlen=self.size)
         self._lock = threading.Lock()
@@ -138,7 +138,7 @@ def _require_time(time_ns: int) -> int:
         return operator.index(time_ns)
     except TypeError as error:
         text = f"time_ns is Unix time in ns, an integer as from time.time_ns(), not {time_ns!r:.40}."
-        raise TypeError(text) from error
+        raise InvalidType(text) from error
 
 
 def frame_image(given: list[Any]) -> Array:
@@ -156,12 +156,12 @@ def frame_image(given: list[Any]) -> Array:
 
     if not isinstance(given[0], np.ndarray):
         kind = type(given[0]).__name__
-        raise TypeError(f"A camera must give NumPy arrays, (y, x) or (y, x, channels), not {kind!r}.")
+        raise InvalidType(f"A camera must give NumPy arrays, (y, x) or (y, x, channels), not {kind!r}.")
     # Before there is a name for it here, which would be one more reference.
     is_new = type(given[0]) is np.ndarray and given[0].flags.owndata and _references(given) <= _ALONE
     image = given.pop()
     if image.ndim not in (2, 3) or not image.size or image.dtype.kind not in "buif":
-        raise ValueError(f"A frame must be (y, x) or (y, x, channels) of numbers, not {image.dtype} {image.shape}.")
+        raise InvalidValue(f"A frame must be (y, x) or (y, x, channels) of numbers, not {image.dtype} {image.shape}.")
     image = image if is_new else np.array(image, order="K")
     image.setflags(write=False)
     return image

@@ -61,7 +61,7 @@ from epypes.batch.items import (
 from epypes.batch.metrics import METRICS
 from epypes.batch.results import short_text
 from epypes.bundle.settings import decode_value
-from epypes.errors import EpypesError, ScaleError, UnknownName
+from epypes.errors import EpypesError, InvalidValue, ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.wording import ended
@@ -505,9 +505,9 @@ def _case_of_table(table: Mapping[str, Any], folder: Path, is_series: bool) -> C
         if key not in _CASE_KEYS:
             raise UnknownName("key", key, _CASE_KEYS, where)
     if "inputs" not in table:
-        raise ValueError(f'There are no inputs {where}. Write: inputs = {{image = "a.png"}}.')
+        raise InvalidValue(f'There are no inputs {where}. Write: inputs = {{image = "a.png"}}.')
     if not (isinstance(checks, list) and all(isinstance(check, Mapping) for check in checks)):
-        raise ValueError(f"The checks {where} are tables: [[case.check]].")
+        raise InvalidValue(f"The checks {where} are tables: [[case.check]].")
     metrics: dict[str, Any] = {}
     expected: dict[str, Any] = {}
     taken: dict[str, int] = {}
@@ -552,7 +552,7 @@ def _hyperparameter(token: str, entry: Any) -> Any:
     try:
         return decode_value(entry)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise ValueError(
+        raise InvalidValue(
             f"Hyperparameter {token!r} can't be read: {ended(str(error))} Write it as in pipeline.toml, such as "
             '{value = [3, 5], kind = "tuple"}.'
         ) from error

@@ -39,7 +39,7 @@ from epypes.batch.packaged_graph import (
 )
 from epypes.batch.results import ErrorInfo, Outcome
 from epypes.bundle.source.clone import clone_runner
-from epypes.errors import EpypesError, ExecutorBroken, ImageFileError, ScaleError
+from epypes.errors import EpypesError, ExecutorBroken, ImageFileError, InvalidType, InvalidValue, ScaleError
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.run.runner import branched
@@ -87,12 +87,12 @@ def run_jobs(
         The graph can't travel to another process.
     """
     if ahead is not None and (type(ahead) is not int or ahead < 1):
-        raise ValueError(f"ahead is how many jobs are at work or waiting, 1 or more, not {ahead!r}.")
+        raise InvalidValue(f"ahead is how many jobs are at work or waiting, 1 or more, not {ahead!r}.")
     stop = stop or threading.Event()
     if executor is None:
         return _run_here(runner, jobs, stop)
     if not isinstance(executor, Executor):
-        raise TypeError(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
+        raise InvalidType(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
     most, over = ahead or _JOBS_PER_WORKER * worker_count(executor), threading.Event()
     backend = _Threads(runner, executor, (stop, over)) if runs_here(executor) else _Processes(runner, executor)
     return _run_in_flight(backend, jobs, most, over, stop)

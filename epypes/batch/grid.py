@@ -287,6 +287,8 @@ def _param(runner: CompGraphRunner, name: str, given: Any) -> Param:
         values = given.tolist()
     elif isinstance(given, Iterable) and not isinstance(given, str | bytes | Mapping | tuple):
         values = list(islice(given, MOST_OUTCOMES + 1))
+    if isinstance(values, list) and not values:
+        raise ScaleError(f"{name}={given!r:.60} has no values. Give at least one, as {name}=[...].")
     try:
         param = as_param(values)
     except (TypeError, ValueError) as error:

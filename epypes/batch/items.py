@@ -14,7 +14,7 @@ from epypes.acquisition.files import IMAGE_ENDINGS, image_files, is_video_name, 
 from epypes.acquisition.frames import Frame, with_images
 from epypes.acquisition.video import Video, VideoFrame
 from epypes.bundle.source.clone import clone_runner
-from epypes.errors import ScaleError
+from epypes.errors import InvalidType, ScaleError
 from epypes.graph import CompGraph, colour_order
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array, is_plain_array
@@ -235,7 +235,9 @@ def _items(images: ImageSet, runner: CompGraphRunner) -> Iterator[Item]:
         yield item
         del item
     if not number:
-        raise ScaleError(f"The image set is empty: the {type(images.values).__name__} gave nothing. Give {_KINDS}.")
+        kind = type(images.values)
+        why = " A generator can be read only once: make a list of it." * issubclass(kind, Iterator)
+        raise ScaleError(f"The image set is empty: the {kind.__name__} gave nothing.{why} Give {_KINDS}.")
 
 
 def _item(number: int, value: Any, free: tuple[str, ...], cg: CompGraph, root: Path | None) -> Item:
@@ -508,6 +510,16 @@ def holds_its_arrays(values: Any) -> bool:
 
 
 def detached_runner(runner: CompGraphRunner) -> CompGraphRunner:
-    """Return another runner, which keeps its values when the given runner's hyperparameters are set or written into."""
+    """Return another runner, which keeps its values when the given runner's hyperparameters are set or written into.
+
+    Raises
+    ------
+    TypeError
+        It is no runner.
+    """
+    if not isinstance(runner, CompGraphRunner):
+        text = f"The first argument must be a CompGraphRunner, not {type(runner).__name__!r}."
+        way_out = " Make one of the graph: ep.CompGraphRunner(cg, hparams)." * isinstance(runner, CompGraph)
+        raise InvalidType(f"{text}{way_out}")
     own = {token: defensive_copy(value) for token, value in runner.hyperparameters.items()}
     return clone_runner(runner, own)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from epypes.errors import InvalidValue
 from epypes.nothing import Nothing
 from epypes.optional import optional_import
 
@@ -117,7 +118,7 @@ def iou(value: Any, expected: Any, *, boxes: BoxForm = "xywh") -> float:
         The shapes differ, one is a mask and the other boxes, or there are too many labels to pair them.
     """
     if boxes not in ("xywh", "xyxy"):
-        raise ValueError(f"boxes is {boxes!r}, not 'xywh' or 'xyxy'.")
+        raise InvalidValue(f"boxes is {boxes!r}, not 'xywh' or 'xyxy'.")
     if _is_boxes(value) and _is_boxes(expected):
         return _boxes_iou(value, expected, boxes)
     got, wanted = _same_shape(value, expected)
@@ -152,15 +153,15 @@ def count(value: Any, *, of: Literal["items", "nonzero", "labels"] | None = None
         found = np.unique(np.asarray(value))
         return float(np.count_nonzero(found))
     if of not in (None, "items"):
-        raise ValueError(f"of is {of!r}, not 'items', 'nonzero' or 'labels'.")
+        raise InvalidValue(f"of is {of!r}, not 'items', 'nonzero' or 'labels'.")
     if of is None and _is_array(value) and value.dtype.kind == "b":
         return float(np.count_nonzero(value))
     if of is None and _is_array(value) and value.ndim == 2 and value.dtype.kind in "iu":
-        raise ValueError(f"{_kind(value)} can be counted in more than one way: give of='items', 'nonzero' or 'labels'.")
+        raise InvalidValue(f"{_kind(value)} can be counted in several ways: give of='items', 'nonzero' or 'labels'.")
     try:
         return float(len(value))
     except TypeError as error:
-        raise ValueError(f"A {_kind(value)} can't be counted. A number is compared by the metric 'value'.") from error
+        raise InvalidValue(f"A {_kind(value)} can't be counted. A number is compared by the metric 'value'.") from error
 
 
 def value(value: Any) -> float:
@@ -176,7 +177,7 @@ def value(value: Any) -> float:
             raise TypeError
         return float(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{_kind(value)} is not a single number.") from error
+        raise InvalidValue(f"{_kind(value)} is not a single number.") from error
 
 
 def mean_abs_difference(value: Any, expected: Any) -> float:
@@ -215,9 +216,9 @@ def psnr(value: Any, expected: Any, *, data_range: float | None = None) -> float
     """
     got, wanted = _pair(value, expected)
     if got.dtype != wanted.dtype:
-        raise ValueError(f"The value is {got.dtype}, what was expected {wanted.dtype}. Give one dtype.")
+        raise InvalidValue(f"The value is {got.dtype}, what was expected {wanted.dtype}. Give one dtype.")
     if data_range is None and got.dtype.kind not in "iu":
-        raise ValueError(f"Of {got.dtype} images, psnr needs data_range.")
+        raise InvalidValue(f"Of {got.dtype} images, psnr needs data_range.")
     if np.array_equal(got, wanted):
         return math.inf
     with optional_import():
@@ -306,7 +307,7 @@ def _labels_iou(got: Any, wanted: Any) -> float:
     (labels, ours), (other_labels, theirs) = (np.unique(array, return_inverse=True) for array in (got, wanted))
     rows, columns = len(labels), len(other_labels)
     if rows * columns > _MOST_PAIRS:
-        raise ValueError(f"The value has {rows} labels, what was expected {columns}: too many to be label images.")
+        raise InvalidValue(f"The value has {rows} labels, what was expected {columns}: too many to be label images.")
     codes = ours.ravel() * columns + theirs.ravel()
     inside = np.bincount(codes, minlength=rows * columns).reshape(rows, columns).astype(np.float64)
     union = inside.sum(axis=1, keepdims=True) + inside.sum(axis=0, keepdims=True) - inside
@@ -344,14 +345,14 @@ def _pair(value: Any, expected: Any) -> tuple[Any, Any]:
 def _same_shape(value: Any, expected: Any) -> tuple[Any, Any]:
     got, wanted = np.asarray(value), np.asarray(expected)
     if got.shape != wanted.shape:
-        raise ValueError(f"The shapes differ: the value is {_kind(got)}, what was expected {_kind(wanted)}.")
+        raise InvalidValue(f"The shapes differ: the value is {_kind(got)}, what was expected {_kind(wanted)}.")
     return got, wanted
 
 
 def _numbers(value: Any, expected: Any) -> tuple[Any, Any]:
     for array in map(np.asarray, (value, expected)):
         if array.dtype.kind not in "biufc":
-            raise ValueError(f"{_kind(array)} are no numbers.")
+            raise InvalidValue(f"{_kind(array)} are no numbers.")
     got, wanted = _same_shape(value, expected)
     dtype = np.result_type(got.dtype, wanted.dtype, np.float64)
     return got.astype(dtype), wanted.astype(dtype)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from epypes.errors import BundleError
+from epypes.errors import BundleError, InvalidType
 from epypes.run.guard import is_plain_array
 
 CONSTANTS: Final = "arrays"
@@ -38,7 +38,7 @@ class StoredArray:
 
     def __post_init__(self) -> None:
         if not isinstance(self.file, str) or not re.fullmatch(rf"{HYPERPARAMETERS}/\w+\.npy", self.file):
-            raise TypeError(f"{self.file!r} is no file of {HYPERPARAMETERS}/")
+            raise InvalidType(f"{self.file!r} is no file of {HYPERPARAMETERS}/")
 
 
 class ArrayFiles:

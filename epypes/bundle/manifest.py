@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from epypes.errors import BundleChanged, BundleError
+from epypes.errors import BundleChanged, BundleError, InvalidValue
 
 # The files of a bundle.
 MODULE: Final = "pipeline.py"
@@ -152,9 +152,9 @@ def _read_manifest(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
                 continue
             value, spaces, name = line.partition("  ")
             if not spaces:
-                raise ValueError(f"{line!r:.60} is no line of it")
+                raise InvalidValue(f"{line!r:.60} is no line of it")
             if recorded.setdefault(name, value) != value:
-                raise ValueError(f"it has two digests for {name!r}")
+                raise InvalidValue(f"it has two digests for {name!r}")
     except (OSError, ValueError) as error:
         raise BundleError(folder, f"{path} can't be read: {error}. Promote again.") from error
     return recorded, facts

@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 from epypes.bundle.arrays import StoredArray
 from epypes.bundle.proof.compare import Tolerance, read_tolerances
 from epypes.catalog import plain, range_of
-from epypes.errors import BundleError
+from epypes.errors import BundleError, InvalidType, InvalidValue
 from epypes.graph import ASSUMED, ColourOrder, CompGraph, inside_of
 from epypes.hints import Param
 from epypes.images import ORDERS, Order
@@ -294,7 +294,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
             text = f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}. Promote the graph again"
             raise BundleError(path, f"{text}, or use the EPypes that wrote it.")
         if "rgb" in ports:
-            raise ValueError("its orders of colours stand under [ports], where an older EPypes wrote them")
+            raise InvalidValue("its orders of colours stand under [ports], where an older EPypes wrote them")
         entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),
@@ -320,21 +320,21 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
 def _read_colours(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, ColourOrder]:
     for token, entry in entries.items():
         if entry["order"] not in ORDERS:
-            raise ValueError(f"the order of the colours of {token!r} is {entry['order']!r}, not bgr or rgb")
+            raise InvalidValue(f"the order of the colours of {token!r} is {entry['order']!r}, not bgr or rgb")
     return {token: ColourOrder(entry["order"], entry.get("function", "")) for token, entry in entries.items()}
 
 
 def _strings(values: Sequence[Any]) -> tuple[str, ...]:
     if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-        raise TypeError(f"{values!r} is not a list of token names")
+        raise InvalidType(f"{values!r} is not a list of token names")
     if len(set(values)) < len(values):
-        raise TypeError(f"{values!r} names a token twice")
+        raise InvalidType(f"{values!r} names a token twice")
     return tuple(values)
 
 
 def _texts(entries: Mapping[str, Any]) -> dict[str, str]:
     if not isinstance(entries, dict) or not all(isinstance(value, str) for value in entries.values()):
-        raise TypeError(f"{entries!r} is no table of token names")
+        raise InvalidType(f"{entries!r} is no table of token names")
     return entries
 
 
@@ -544,7 +544,7 @@ def decode_value(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = Non
     if kind is None:
         return value
     if kind not in _KINDS:
-        raise TypeError(f"no value has the kind {kind!r}")
+        raise InvalidType(f"no value has the kind {kind!r}")
     return _KINDS[kind].read(value, entry, enums)
 
 

@@ -20,7 +20,7 @@ from epypes.display.views.full_pictures import address_of, kept_pictures, run_of
 from epypes.display.views.graphview import GraphView, to_json
 from epypes.display.views.groups import function_count
 from epypes.display.views.view import view
-from epypes.errors import LayoutUnavailable
+from epypes.errors import InvalidValue, LayoutUnavailable
 from epypes.run import Plan, Run, RunReport, TimingSummary
 from epypes.run.timing import Reports
 from epypes.wording import counted
@@ -141,7 +141,7 @@ class Figure:
         elif path.suffix == ".json":
             text = json.dumps(to_json(self.view))
         else:
-            raise ValueError(f"save() writes .svg, .html, .png, .pdf and .json, not {path.name!r}. Use one of these.")
+            raise InvalidValue(f"save() writes .svg, .html, .png, .pdf and .json, not {path.name!r}. Use one of these.")
         path.write_text(text, encoding="utf-8")
         return path
 

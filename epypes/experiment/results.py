@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 import pandas as pd
 
+from epypes.errors import InvalidValue
+
 if TYPE_CHECKING:
     from epypes.experiment.run import Answer
 
@@ -109,13 +111,13 @@ def answered(table: pd.DataFrame, *columns: str) -> np.ndarray:
     """
     if not isinstance(table, pd.DataFrame):
         kind = type(table).__name__
-        raise ValueError(f"A table of an experiment is needed, as run_experiment(...).table, not {kind!r}.")
+        raise InvalidValue(f"A table of an experiment is needed, as run_experiment(...).table, not {kind!r}.")
     if table.empty:
         return np.zeros(0, dtype=bool)
     missing = [column for column in ("experiment", "failure", *columns) if column not in table]
     if missing:
         names = ", ".join(map(repr, missing))
-        raise ValueError(
+        raise InvalidValue(
             f"The table has no column {names}. It must be that of an experiment: run_experiment(...).table."
         )
     # An empty text is missing once the table has been read from a file.

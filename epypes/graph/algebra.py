@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from epypes.errors import Finding, GraphError, UnknownName, require_mapping
+from epypes.errors import Finding, GraphError, InvalidType, InvalidValue, UnknownName, require_mapping
 from epypes.graph.compgraph import CompGraph, FuncIO
 from epypes.graph.identity import have_one_name, is_same_default, is_same_function
 from epypes.graph.placeholder import is_placeholder
@@ -50,7 +50,7 @@ def union(*graphs: CompGraph, suffixes: Sequence[str] | None = None, keep: str |
         parts = [cg._parts() for cg in graphs]
     elif isinstance(suffixes, str) or not isinstance(suffixes, Sequence) or len(suffixes) != len(graphs):
         text = f"union() of {len(graphs)} graphs needs a sequence of {len(graphs)} suffixes, one per graph, not "
-        raise ValueError(f"{text}{suffixes!r}.")
+        raise InvalidValue(f"{text}{suffixes!r}.")
     else:
         parts = [_suffixed(cg, ending, kept) for cg, ending in zip(graphs, suffixes, strict=True)]
     merged = GraphParts(types=all(cg.types for cg in graphs))
@@ -231,7 +231,7 @@ def rename(
         for old, new in names.items():
             require(old)
             if not isinstance(new, str) or not new:
-                raise TypeError(f"The new name of {old!r} must be a string that is not empty, not {new!r}.")
+                raise InvalidType(f"The new name of {old!r} must be a string that is not empty, not {new!r}.")
     return _built(_renamed(cg, functions, tokens))
 
 
@@ -269,7 +269,7 @@ def suffix(cg: CompGraph, ending: str, keep: str | Iterable[str] = ()) -> CompGr
 def _suffixed(cg: CompGraph, ending: str, keep: Iterable[str]) -> GraphParts:
     """Return the parts of a graph with an ending on every name that is not kept, those of its groups included."""
     if not isinstance(ending, str):
-        raise TypeError(f'A suffix must be a string, such as "_1", not {ending!r}.')
+        raise InvalidType(f'A suffix must be a string, such as "_1", not {ending!r}.')
     kept = frozenset(keep)
     parts = _renamed(
         cg,
@@ -343,7 +343,7 @@ def group(cg: CompGraph, name: str, functions: str | Iterable[str]) -> CompGraph
     """
     _require_graph("group()", cg)
     if not isinstance(name, str) or not name:
-        raise TypeError(f"The name of a group must be a string that is not empty, not {name!r}.")
+        raise InvalidType(f"The name of a group must be a string that is not empty, not {name!r}.")
     inside = dict.fromkeys(names_of("functions", functions))
     for function in inside:
         cg.require_function(function)
@@ -446,7 +446,7 @@ def names_of(what: str, names: str | Iterable[str]) -> tuple[str, ...]:
     if isinstance(names, str):
         return (names,)
     if not isinstance(names, Iterable):
-        raise TypeError(f"{what} must be a name or an iterable of names, not {type(names).__name__!r}.")
+        raise InvalidType(f"{what} must be a name or an iterable of names, not {type(names).__name__!r}.")
     return tuple(names)
 
 
@@ -462,4 +462,4 @@ def _require_graph(what: str, cg: object) -> None:
     """Raise unless this is a graph, with the way to the graph of a runner or a pipeline."""
     if not isinstance(cg, CompGraph):
         way_out = "Give its graph: .cg." if hasattr(cg, "cg") else "Make one with ep.CompGraph(func_dict, func_io)."
-        raise TypeError(f"{what} takes computational graphs, not {type(cg).__name__!r}. {way_out}")
+        raise InvalidType(f"{what} takes computational graphs, not {type(cg).__name__!r}. {way_out}")

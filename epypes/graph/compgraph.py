@@ -9,7 +9,7 @@ from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.deprecation import OldNames, takes_old_keywords
-from epypes.errors import Finding, GraphError, UnknownName, require_mapping
+from epypes.errors import Finding, GraphError, InvalidType, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.colours import ColourOrder, find_orders
 from epypes.graph.identity import is_redefined_inside, redefined
@@ -70,6 +70,9 @@ class CompGraph(OldNames):
     """
 
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
+        if callable(func_dict):
+            text = "func_dict must be a mapping by function name, not a function."
+            raise InvalidType(f"{text} Of functions alone: CompGraph.from_functions(function, ...).")
         for what, given in (("func_dict", func_dict), ("func_io", func_io)):
             require_mapping(what, given, "by function name")
         self._build(GraphParts(dict(func_dict), dict(func_io), types=types))
@@ -297,7 +300,7 @@ class CompGraph(OldNames):
 
     def __repr__(self) -> str:
         count = len(self._functions)
-        start = f"<CompGraph: {counted(count, 'function')}, {len(self._tokens)} tokens; "
+        start = f"<CompGraph: {counted(count, 'function')}, {counted(len(self._tokens), 'token')}; "
         end = _redefined_text(self) + ">"
         width = min(18, (95 - len(start) - len(end)) // 2)
         return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
@@ -327,7 +330,10 @@ def _read_functions(functions: Iterable[Any], types: bool) -> GraphParts:
 def _declaration(function: Any, taken: Container[str]) -> inspect.Signature | Finding:
     """Return the signature of a function that has one and a name that is not taken, else what is wrong with it."""
     if not callable(function):
-        text = f"{function!r:.60} is {type(function).__name__}, which can't be called. Give functions, one by one."
+        kind = type(function).__name__
+        text = f"A graph is made of functions, not of {kind!r}. Give the function itself: edges, not edges(image)."
+        if isinstance(function, list | tuple) and all(map(callable, function)):
+            text = f"Give functions one by one, not as a {kind}: CompGraph.from_functions(*functions)."
         return Finding("not callable", text, ())
     name = getattr(function, "__name__", None)
     if not isinstance(name, str) or not name.isidentifier():

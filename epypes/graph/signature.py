@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from types import FunctionType
 from typing import Any, Final, TypeGuard, TypeVar
 
+from epypes.errors import InvalidType, InvalidValue
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 _OUTPUTS: Final = "__epypes_outputs__"
@@ -108,17 +110,17 @@ def outputs(*names: str) -> Callable[[F], F]:
     for name in names:
         if not isinstance(name, str) or not name:
             text = f"outputs() takes the names of tokens, not {name!r}."
-            raise TypeError(text + ' Write @ep.outputs("a", "b") above the function.' * callable(name))
+            raise InvalidType(text + ' Write @ep.outputs("a", "b") above the function.' * callable(name))
     twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
     if twice:
-        raise ValueError(f"outputs() names {', '.join(map(repr, twice))} twice. Every output is a token of its own.")
+        raise InvalidValue(f"outputs() names {', '.join(map(repr, twice))} twice. Every output is a token of its own.")
 
     def mark(function: F) -> F:
         try:
             setattr(function, _OUTPUTS, names)
         except (AttributeError, TypeError) as error:
             name = getattr(function, "__name__", function)
-            raise TypeError(
+            raise InvalidType(
                 f"{name!r} can't be marked. Write a function (def) that calls it, and mark that."
             ) from error
         return function

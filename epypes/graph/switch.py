@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Hashable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from epypes.errors import UnknownName, require_mapping
+from epypes.errors import InvalidType, InvalidValue, UnknownName, require_mapping
 from epypes.graph.identity import innermost
 
 if TYPE_CHECKING:
@@ -100,9 +100,9 @@ def switch(name: str, branches: Mapping[Any, str], by: str, output: str) -> Comp
 
     require_mapping("branches", branches, "from selector values to tokens")
     if not branches:
-        raise ValueError(f"Switch {name!r} has no branches. Give at least one: {{value of {by!r}: token}}.")
+        raise InvalidValue(f"Switch {name!r} has no branches. Give at least one: {{value of {by!r}: token}}.")
     if not isinstance(output, str):
         text = f"output takes one token, not {type(output).__name__!r}: a switch passes on one value as it is."
-        raise TypeError(f"{text} Put a function behind it, which takes the value apart.")
+        raise InvalidType(f"{text} Put a function behind it, which takes the value apart.")
     function = Switch(name, tuple(branches))
     return CompGraph({name: function}, {name: ((by, *branches.values()), output)})

@@ -368,7 +368,7 @@ def _warn_of_running_loops() -> None:
         if loop.is_running and not loop._stop.is_set():
             # Logged, since a ResourceWarning is hidden by default, and a program that ends at once should say why.
             _log.warning(
-                "%r was left running when the program ended: its thread is a daemon. Call its join(), or ep.wait(), to "
-                "go on until it is stopped; call its stop(), or use it in a with statement, to end it.",
+                "%r was left running when the program ended, and has ended with it. To keep the program running, let "
+                "it end with ep.wait(). Else call stop(), or use a with statement.",
                 loop.name,
             )

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any, Final, Literal, get_args
 
-from epypes.errors import MailboxOverflow
+from epypes.errors import InvalidValue, MailboxOverflow
 from epypes.pipeline.event_loop import log_error, reject
 
 Policy = Literal["latest", "drop_oldest", "block", "fault"]
@@ -55,9 +55,9 @@ class Mailbox:
         self, policy: Policy = "latest", size: int = 1, *, on_drop: Callable[[Any], None] | None = None
     ) -> None:
         if policy not in _POLICIES:
-            raise ValueError(f"No policy {policy!r}. There are: {', '.join(_POLICIES)}.")
+            raise InvalidValue(f"No policy {policy!r}. There are: {', '.join(_POLICIES)}.")
         if size < 1 or (policy == "latest" and size != 1):
-            raise ValueError(f"A mailbox with policy {policy!r} can't have size {size}.")
+            raise InvalidValue(f"A mailbox with policy {policy!r} can't have size {size}.")
         self.policy, self.size, self._on_drop = policy, size, on_drop
         self.dropped: Counter[str] = Counter()
         self._items: deque[Any] = deque()
@@ -94,7 +94,7 @@ class Mailbox:
         """
         with self._changed:
             if self._take is not None:
-                raise ValueError("The items of this mailbox are handed to another taker. Give each publisher its own.")
+                raise InvalidValue("The items of this mailbox go to another taker. Give each publisher its own.")
             while self._items:
                 take(self._items.popleft())
             self._take = take
@@ -200,4 +200,4 @@ class Mailbox:
 def _require_timeout(block: bool, timeout: float | None) -> None:
     # As in queue.Queue; NaN, which is neither too short nor too long, would never be over.
     if block and timeout is not None and not timeout >= 0:
-        raise ValueError(f"timeout is how many seconds to wait, 0 or more, not {timeout!r}.")
+        raise InvalidValue(f"timeout is how many seconds to wait, 0 or more, not {timeout!r}.")

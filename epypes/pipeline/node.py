@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 from weakref import ref
 
 from epypes.deprecation import OldNames
+from epypes.errors import InvalidType
 from epypes.graph import CompGraph
 from epypes.run.guard import WATCH, called_for
 
@@ -44,7 +45,7 @@ class Node(OldNames):
 
     def __init__(self, name: str, func: Callable[..., Any]) -> None:
         if not callable(func):
-            raise TypeError(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
+            raise InvalidType(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
         self.name = name
         self.func = called_for(name, func)
         # Nanoseconds of the last call, and how many there were.
@@ -154,7 +155,7 @@ class NodeBasedCompGraph(CompGraph):
 
     def __init__(self, cg: CompGraph) -> None:
         if not isinstance(cg, CompGraph):
-            raise TypeError(f"A NodeBasedCompGraph is made of a CompGraph, not {type(cg).__name__!r}.")
+            raise InvalidType(f"A NodeBasedCompGraph is made of a CompGraph, not {type(cg).__name__!r}.")
         self._build(cg._parts())
 
     def _build(self, parts: GraphParts) -> None:

@@ -11,7 +11,7 @@ from time import perf_counter_ns
 from typing import Any, Literal
 
 from epypes.deprecation import takes_old_keywords
-from epypes.errors import HyperparameterError, PayloadError, run_call
+from epypes.errors import HyperparameterError, InvalidType, PayloadError, run_call
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
 from epypes.pipeline.node import Node, NodeBasedCompGraph
@@ -100,7 +100,7 @@ class Pipeline(Node, TokenMapping):
     ) -> None:
         if not isinstance(cg, CompGraph):
             way_out = "Give its graph: .cg" if isinstance(getattr(cg, "cg", None), CompGraph) else "Pipeline(name, cg)"
-            raise TypeError(f"A pipeline runs a CompGraph, not {type(cg).__name__!r}. {way_out}.")
+            raise InvalidType(f"A pipeline runs a CompGraph, not {type(cg).__name__!r}. {way_out}.")
         self.network = NodeBasedCompGraph(cg)
         self.runner = CompGraphRunner(self.network, hparams, workers=workers, guard=guard)
         self.source_cg = cg

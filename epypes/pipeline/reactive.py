@@ -16,7 +16,7 @@ from time import perf_counter_ns, time_ns
 from typing import Any, Final, Self
 
 from epypes.deprecation import OldNames, takes_old_keywords
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, InvalidType
 from epypes.graph import CompGraph
 from epypes.pipeline.event_loop import EventLoop, is_kept, log_error, settle
 from epypes.pipeline.mailbox import Mailbox
@@ -397,7 +397,7 @@ class SinkPipeline(_Reactive):
     def _require_mapping(self, payload: Any) -> None:
         if not isinstance(payload, Mapping):
             text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
-            raise TypeError(text)
+            raise InvalidType(text)
 
     @property
     def _busy(self) -> tuple[str, ...]:

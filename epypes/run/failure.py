@@ -25,6 +25,8 @@ _CONTAINERS: Final = frozenset((list, tuple, dict, set, frozenset, deque, bytes,
 _MOST_ITEMS: Final = 1_000
 # What functions say that have got None for an image: Python's own operations, and those of OpenCV.
 _OF_NONE: Final = re.compile(r"None|\bempty\b|OpenCV\(")
+# What OpenCV and Python say that have got a path for an image.
+_OF_TEXT: Final = re.compile(r"not a numpy array|(str|Path)' object has no attribute")
 _WAS_IT_FOUND: Final = "Was the file found? cv2.imread returns None for a file that it can't read."
 _DOES_IT_RETURN: Final = (
     "Does it return a value? One that has found nothing can return ep.Nothing: what takes that is skipped."
@@ -137,6 +139,9 @@ def _causes(tokens: TokenManager, place: int, exception: BaseException, frozen: 
             is_reader = any(isinstance(tokens.values[given], str | os.PathLike) for given in made.inputs)
             why = _WAS_IT_FOUND if is_reader else _DOES_IT_RETURN
             yield f"{token} is None, made by function {made.name!r}. {why}"
+        elif isinstance(value, str | os.PathLike) and token not in frozen and _OF_TEXT.search(str(exception)):
+            kind = "text" if isinstance(value, str) else "path"
+            yield f"{token} is a {kind}, not an image. Read the file first: cv2.imread({str(value)!r:.{_BRIEF}})."
         elif value is not None and (type(value) in _NUMBERS or is_numpy_scalar(type(value))):
             reason = reason_against(program.cg, step.name, token, value)
             if reason:

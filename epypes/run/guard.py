@@ -20,7 +20,7 @@ from sys import getrefcount
 from types import BuiltinFunctionType, FunctionType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from epypes.errors import IteratorRefused
+from epypes.errors import InvalidType, IteratorRefused
 from epypes.graph.identity import innermost
 from epypes.graph.signature import documented_in_out
 from epypes.nothing import Nothing, NothingGiven, NothingType
@@ -60,7 +60,7 @@ def unguarded(function: F) -> F:
         setattr(function, _MARK, True)
     except (AttributeError, TypeError) as error:
         name = getattr(function, "__name__", function)
-        raise TypeError(f"{name!r} can't be marked. Write a function (def) that calls it, and mark that.") from error
+        raise InvalidType(f"{name!r} can't be marked. Write a function (def) that calls it, and mark that.") from error
     return function
 
 

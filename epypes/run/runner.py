@@ -12,7 +12,16 @@ from typing import Any, Final
 from weakref import ref
 
 from epypes.deprecation import OldNames, takes_old_keywords
-from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, require_mapping, run_call
+from epypes.errors import (
+    InvalidType,
+    InvalidValue,
+    NotComputed,
+    PayloadError,
+    StaleToken,
+    UnknownName,
+    require_mapping,
+    run_call,
+)
 from epypes.graph import CompGraph, redefined
 from epypes.run.execute import Executor, Way
 from epypes.run.failure import Failure, failure_of
@@ -88,11 +97,11 @@ class CompGraphRunner(OldNames, TokenMapping):
     ) -> None:
         if not isinstance(cg, CompGraph):
             kind = type(cg).__name__
-            raise TypeError(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
+            raise InvalidType(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
         hparams = {} if hparams is None else hparams
         require_mapping("hparams", hparams, "of tokens to values")
         if type(workers) is not int or workers < 1:
-            raise ValueError(f"workers is how many functions may run at once, 1 or more, not {workers!r}.")
+            raise InvalidValue(f"workers is how many functions may run at once, 1 or more, not {workers!r}.")
         self.cg = cg
         self.workers = workers
         self.guard = guard
@@ -370,7 +379,7 @@ class CompGraphRunner(OldNames, TokenMapping):
         """
         key, before, last, kept = getattr(run, "trial_of", (None,) * 4)
         if key is not self._key:
-            raise ValueError("Only a run that this runner's trial() returned can be adopted.")
+            raise InvalidValue("Only a run that this runner's trial() returned can be adopted.")
         with self._series, self._lock:
             now = self._hparams.current if self._program.nested else self._hparams
             is_as_it_was = before is now and (None if last is None else last()) is self.last

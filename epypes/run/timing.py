@@ -16,6 +16,7 @@ from statistics import NormalDist, fmean
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, overload
 
+from epypes.errors import InvalidType, InvalidValue
 from epypes.optional import optional_import
 from epypes.rich_display import Displayed
 from epypes.run.program import Program
@@ -402,15 +403,15 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
     # A copy, since a run in another thread may add to the runner's reports meanwhile.
     given = tuple(reports) if isinstance(reports, Iterable) else (reports,)
     if not given:
-        raise ValueError("There is no report to summarize. Run something first: runner.run(...), then runner.reports.")
+        raise InvalidValue("There is no report to summarize. Run something: runner.run(...), then runner.reports.")
     for report in given:
         if not isinstance(report, RunReport):
             kind = type(report).__name__
-            raise TypeError(f"summarize takes RunReports, such as runner.reports, not {kind!r}.")
+            raise InvalidType(f"summarize takes RunReports, such as runner.reports, not {kind!r}.")
     ended = [report for report in given if report.failed is None]
     if not ended:
         failed = "The only run has failed" if len(given) == 1 else f"All {len(given)} runs have failed"
-        raise ValueError(f"{failed}, so there are no times to summarize. runner.last.failure says why.")
+        raise InvalidValue(f"{failed}, so there are no times to summarize. runner.last.failure says why.")
     durations = _by_function(ended)
     return TimingSummary(
         functions=MappingProxyType({name: _fit(values) for name, values in durations.items() if values}),

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.settings import encode_value
-from epypes.errors import ParametersRefused, RevisionConflict, ServiceError, UnknownName
+from epypes.errors import InvalidValue, ParametersRefused, RevisionConflict, ServiceError, UnknownName
 
 if TYPE_CHECKING:
     from epypes.bundle.settings import Settings
@@ -96,7 +96,7 @@ def _with_value(entries: Entries, token: str, given: Any) -> dict[str, Any]:
     entry = entries[token]
     if entry.get("kind") not in _KINDS or isinstance(entry.get("value"), dict):
         what = entry.get("kind", "table")
-        raise ValueError(f"{token!r} is of kind {what!r}, which can't be changed while it is served. Promote it anew.")
+        raise InvalidValue(f"{token!r} is of kind {what!r}, which can't be changed while it is served. Promote again.")
     _check_plain(token, given)
     rest = {key: part for key, part in entry.items() if key not in _VALUE_KEYS}
     if entry.get("choices") is not None:
@@ -195,7 +195,7 @@ def _check_plain(token: str, given: Any) -> None:
         is_beyond = isinstance(item, int) and abs(item) >= _MOST_WHOLE
         if not isinstance(item, bool | int | float | str | None) or is_beyond or _has_no_number(item):
             text = "give a number, text, true, false, null or a list of these"
-            raise ValueError(f"{token!r} can't be {_brief(given)}: {text}.")
+            raise InvalidValue(f"{token!r} can't be {_brief(given)}: {text}.")
 
 
 def _chosen(token: str, given: Any, entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,7 +205,7 @@ def _chosen(token: str, given: Any, entry: Mapping[str, Any]) -> dict[str, Any]:
         has_kind = isinstance(choice, dict) and "kind" in choice
         if _is_same(given, choice["value"] if has_kind and "value" in choice else choice):
             return dict(choice) if has_kind else {**value_of(entry), "value": choice}
-    raise ValueError(f"{token!r} can't be {_brief(given)}. There are: {', '.join(map(_brief, choices))}.")
+    raise InvalidValue(f"{token!r} can't be {_brief(given)}. There are: {', '.join(map(_brief, choices))}.")
 
 
 def _converted(token: str, given: Any, entry: Mapping[str, Any]) -> Any:
@@ -216,9 +216,9 @@ def _converted(token: str, given: Any, entry: Mapping[str, Any]) -> Any:
     if type(given) is float and type(before) is int and not is_float:
         return _whole(token, given, entry)
     if type(given) is not type(before) and not (is_float and type(given) is float):
-        raise ValueError(f"{token!r} is {_kind(before)}, and {_brief(given)} is {_kind(given)}.")
+        raise InvalidValue(f"{token!r} is {_kind(before)}, and {_brief(given)} is {_kind(given)}.")
     if isinstance(before, list) and len(before) != len(given):
-        raise ValueError(f"{token!r} has {len(before)} items, and {_brief(given)} has {len(given)}.")
+        raise InvalidValue(f"{token!r} has {len(before)} items, and {_brief(given)} has {len(given)}.")
     return given
 
 
@@ -227,7 +227,7 @@ def _whole(token: str, value: float, entry: Mapping[str, Any]) -> int | float:
     if _may_have_fraction(entry):
         return value
     if not value.is_integer():
-        raise ValueError(f"{token!r} is a whole number, and {value} is none.")
+        raise InvalidValue(f"{token!r} is a whole number, and {value} is none.")
     return int(value)
 
 
@@ -237,9 +237,9 @@ def _check_range(token: str, value: Any, entry: Mapping[str, Any]) -> None:
     low, high = entry.get("low"), entry.get("high")
     if (low is not None and value < low) or (high is not None and value > high):
         ends = f"from {low}" if high is None else f"up to {high}" if low is None else f"from {low} to {high}"
-        raise ValueError(f"{token!r} goes {ends}, and {value} is outside.")
+        raise InvalidValue(f"{token!r} goes {ends}, and {value} is outside.")
     if entry.get("odd") and value % 2 != 1:
-        raise ValueError(f"{token!r} is odd, and {value} is not.")
+        raise InvalidValue(f"{token!r} is odd, and {value} is not.")
     _check_step(token, value, entry.get("step"), low or 0)
 
 
@@ -248,7 +248,7 @@ def _check_step(token: str, value: float, step: float | None, begin: float) -> N
         return
     steps = (value - begin) / step
     if abs(steps - round(steps)) > _STEP_TOLERANCE:
-        raise ValueError(f"{token!r} goes in steps of {step} from {begin}, and {value} is between two.")
+        raise InvalidValue(f"{token!r} goes in steps of {step} from {begin}, and {value} is between two.")
 
 
 def _is_same(given: Any, choice: Any) -> bool:

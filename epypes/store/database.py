@@ -16,7 +16,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects.mysql import LONGTEXT
 from sqlalchemy.exc import ArgumentError, IntegrityError, NoSuchModuleError, SQLAlchemyError
 
-from epypes.errors import StoreError
+from epypes.errors import InvalidType, StoreError, install_command
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
@@ -99,7 +99,7 @@ class Database:
             )
         except (NoSuchModuleError, ImportError, ArgumentError) as error:
             kind, driver = url.get_backend_name(), url.drivername.partition("+")[2]
-            way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
+            way_out = install_command("postgres") if driver == "psycopg" else f"Install a driver of {kind}"
             missing = getattr(error, "name", None)
             reason = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {url.drivername!r}"
             text = f"{self.place} can't be opened: {reason}. {way_out}, or store in a file: 'results.sqlite'."
@@ -202,7 +202,7 @@ def database_url(given: str | Path) -> sa.URL:
         It is neither a path nor a URL.
     """
     if not isinstance(given, str | Path):
-        raise TypeError(f"A store is a path or a URL, not {given!r:.80}. Name a file: 'results.sqlite'.")
+        raise InvalidType(f"A store is a path or a URL, not {given!r:.80}. Name a file: 'results.sqlite'.")
     if isinstance(given, Path) or "://" not in given:
         url = sa.URL.create("sqlite", database=str(Path(given).expanduser()) if str(given).strip() else "")
     else:

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.errors import StoreError
+from epypes.errors import InvalidType, StoreError
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ class Series:
         try:
             return json.dumps(_encoded(dict(data)), allow_nan=False, separators=(",", ":"))
         except (TypeError, ValueError, RecursionError) as error:
-            raise TypeError(f"Row {key!r:.200} of {self.kind} {self.name!r} can't be stored: {error}.") from error
+            raise InvalidType(f"Row {key!r:.200} of {self.kind} {self.name!r} can't be stored: {error}.") from error
 
     def put(self, rows: Mapping[str, str]) -> None:
         """Write rows that are encoded, by key: all of them, or none; raise StoreError, as `append` does."""
@@ -233,7 +233,7 @@ class Series:
 def _name_text(name: str) -> str:
     """Return the JSON text of a kind, name or key."""
     if not isinstance(name, str):
-        raise TypeError(f"Kinds, names and keys of series are texts, not {type(name).__name__!r}: {name!r:.80}")
+        raise InvalidType(f"Kinds, names and keys of series are texts, not {type(name).__name__!r}: {name!r:.80}")
     return json.dumps(name)
 
 
@@ -244,7 +244,7 @@ def _encoded(value: Any) -> Any:
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):  # as a text it may be the same as another key: 1 and "1"
-                raise TypeError(f"key {key!r:.80} is no text; as one it is {str(key)!r:.80}")
+                raise InvalidType(f"key {key!r:.80} is no text; as one it is {str(key)!r:.80}")
         return {f"${key}" if key.startswith("$") else key: _encoded(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_encoded(item) for item in value]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple, get_args
 from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
 
-from epypes.errors import AddressError
+from epypes.errors import AddressError, install_command
 from epypes.transport.channel import Channel, ChannelOptions
 
 Kind = Literal["queue", "broadcast", "log"]
@@ -337,7 +337,7 @@ def open_channel(address: str | Address, options: ChannelOptions | None = None) 
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.startswith("epypes"):
             raise
-        text = f"{parsed} needs {error.name}, which is not installed: pip install 'epypes[{parsed.extra}]'."
+        text = f"{parsed} needs {error.name}, which is not installed: {install_command(parsed.extra)}."
         raise AddressError(str(parsed), text) from error
     made: Channel = module.make_channel(parsed, options or ChannelOptions())
     return made

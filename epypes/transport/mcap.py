@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
 
-from epypes.errors import RecordingError
+from epypes.errors import InvalidValue, RecordingError
 from epypes.optional import optional_import
 from epypes.transport.channel import Frames
 from epypes.wire.foxglove import FoxgloveImage, foxglove_images, image_data
@@ -306,10 +306,10 @@ def _unpacked(data: bytes, images: Sequence[bytes]) -> list[memoryview]:
             continue
         place = start + length
         if place > len(view):
-            raise ValueError("a frame is longer than its message")
+            raise InvalidValue("a frame is longer than its message")
         frames.append(view[start:place])
     if not frames or place != len(view):
-        raise ValueError("the frames are not the whole message")
+        raise InvalidValue("the frames are not the whole message")
     return frames
 
 

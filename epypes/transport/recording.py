@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
-from epypes.errors import BrokerError, RecordingError, StillRunning
+from epypes.errors import BrokerError, InvalidValue, RecordingError, StillRunning
 from epypes.transport.address import parse_address
 from epypes.transport.channel import Delivery, Frames
 from epypes.transport.endpoint import Startable, warn_left_running
@@ -401,9 +401,9 @@ class Player(Startable):
         on_end: Callable[[], None] = _nothing,
     ) -> None:
         if not 0 <= speed < math.inf:
-            raise ValueError(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
+            raise InvalidValue(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
         if loop < 0:
-            raise ValueError(f"loop is {loop}; give how often, or 0 for without end.")
+            raise InvalidValue(f"loop is {loop}; give how often, or 0 for without end.")
         parsed = parse_address(address)
         self._given = parsed.endpoint
         binds = bind if parsed.binds is None else parsed.binds

@@ -14,7 +14,7 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Protocol, Self, get_args
 
-from epypes.errors import BrokerError, MessageError, StillRunning
+from epypes.errors import BrokerError, InvalidValue, MessageError, StillRunning
 from epypes.transport.address import Address
 from epypes.transport.channel import ERROR, ERROR_REASON, Channel, Delivery
 from epypes.transport.deduplication import Deduplication
@@ -157,7 +157,7 @@ class Subscriber(Endpoint):
         timeout_s: float = 10.0,
     ) -> None:
         if acknowledge not in get_args(Acknowledge):
-            raise ValueError(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
+            raise InvalidValue(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
         self._prefetch = _checked(prefetch)
         super().__init__(
             address,
@@ -338,7 +338,7 @@ def _hold_s(ordered: bool | float, address: Address) -> float:
 
 def _checked(prefetch: int) -> int:
     if prefetch < 1:
-        raise ValueError(f"prefetch is a whole number from 1, not {prefetch!r}.")
+        raise InvalidValue(f"prefetch is a whole number from 1, not {prefetch!r}.")
     return prefetch
 
 

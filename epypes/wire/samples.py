@@ -17,7 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from epypes.errors import MessageError
+from epypes.errors import InvalidValue, MessageError
 from epypes.optional import optional_import
 from epypes.wire.arrays import flat_bytes
 from epypes.wire.decoder import ValueReader
@@ -158,7 +158,7 @@ def read_sample(path: str | Path) -> Sample:
         with Path(path).open("rb") as file, zipfile.ZipFile(file) as archive:
             described = json.loads(str(_read_entry(archive, _DESCRIPTION)[()]))
             if described["format"] != FORMAT:
-                raise ValueError(f"its format is {described['format']!r}, and this version reads {FORMAT}")
+                raise InvalidValue(f"its format is {described['format']!r}, and this version reads {FORMAT}")
             views = [flat_bytes(_read_entry(archive, name)) for name in described["arrays"]]
         reader = ValueReader(views, _LIMITS)
         sides = {**dict.fromkeys(_SIDES[2:], ()), **described}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -45,6 +46,11 @@ class Environment:
     def epypes(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run a command of EPypes."""
         return self._run([str(self.bin / "epypes"), *arguments])
+
+    def would_install(self, requirement: str) -> set[str]:
+        """Return the packages that an installation would add or replace."""
+        install = [*UV, "pip", "install", "--dry-run", "--python", str(self.bin / "python"), requirement]
+        return set(re.findall(r"^ [+-] ([\w.-]+)", self._run(install).stderr, re.MULTILINE))
 
     def _run(self, command: list[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False, timeout=240)

@@ -86,6 +86,10 @@ def test_the_core_imports_without_any_extra(environment):
     assert "pip install 'epypes[graphviz]'" in told
     done = alone.epypes("--help")
     assert done.returncode == 0, done.stderr
+    # The command that it names adds the packages, and leaves the EPypes that is installed.
+    added = alone.would_install("epypes[graphviz]")
+    assert {"graphviz", "pygraphviz"} <= added
+    assert "epypes" not in added
 
 
 def test_the_first_tutorial_runs_with_what_colab_has_and_one_line(environment):

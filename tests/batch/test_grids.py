@@ -140,7 +140,7 @@ def test_a_logarithmic_range_is_drawn_as_often_below_its_geometric_mean_as_above
     ("grid", "how", "said"),
     [
         ({}, {}, "is a mapping of hyperparameters to values"),
-        ({"offset": []}, {}, r"offset=\[\]: choices is empty. Name at least one value"),
+        ({"offset": []}, {}, r"offset=\[\] has no values. Give at least one"),
         ({"offset": (1, 9)}, {}, r"is a range.*offset=\[1, 9\].*how='random'"),
         ({"offset": 3}, {}, r"offset=3 is neither a range, .* nor a list of values. Write offset=\[...\]"),
         ({"offset": np.array(5)}, {}, r"nor a list of values. Write offset=\[...\]"),

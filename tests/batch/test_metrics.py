@@ -151,7 +151,7 @@ def test_what_is_counted_is_said_where_it_could_be_two_things():
     assert count(labels, of="labels") == 2
     assert count(labels, of="nonzero") == 4
     assert count(labels, of="items") == 2
-    with pytest.raises(ValueError, match="int64 2 x 3 can be counted in more than one way: give of="):
+    with pytest.raises(ValueError, match="int64 2 x 3 can be counted in several ways: give of="):
         count(labels)
     with pytest.raises(ValueError, match="compared by the metric 'value'"):
         count(3)

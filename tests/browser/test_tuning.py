@@ -126,16 +126,16 @@ def test_figures_are_explored_and_the_shortcuts_of_jupyterlab_stay_out(notebook:
     figure.locator("#token-edges").hover()
     assert page.locator(".epypes-card:popover-open").first.inner_text().splitlines()[0] == "token edges"
     cells = page.evaluate("jupyterapp.shell.currentWidget.content.model.cells.length")
-    figure.locator("#function-canny").click()
-    figure.locator("#function-canny").focus()
+    figure.locator("#function-edges").click()
+    figure.locator("#function-edges").focus()
     for key in ("d", "d", "b", "x"):
         page.keyboard.press(key)
     assert page.evaluate("jupyterapp.shell.currentWidget.content.model.cells.length") == cells
-    assert figure.locator(".epypes-about").inner_text().startswith("function canny")
+    assert figure.locator(".epypes-about").inner_text().startswith("function edges")
     for theme in notebook.each_theme():
         identity = figure.locator(".epypes-about").evaluate("each => each.closest('.epypes-sheet').id = 'explored'")
         assert unreadable(page, f"#{identity}") == [], theme
-    figure.locator("#function-canny").focus()
+    figure.locator("#function-edges").focus()
     page.keyboard.press("Escape")
     assert figure.locator(".epypes-about").inner_text() == ""
     assert not notebook.page_errors

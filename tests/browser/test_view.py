@@ -463,12 +463,16 @@ def test_a_typed_number_is_committed_by_enter(view: ViewPage) -> None:
     assert _values(view) == [{"blur_kernel": 9}]
 
 
-def test_an_even_number_becomes_the_next_odd_one(view: ViewPage) -> None:
+def test_an_even_number_becomes_the_next_odd_one_and_the_panel_says_so_until_the_next_value(view: ViewPage) -> None:
     view.page.fill(KERNEL, "8")
     view.press("Tab")
     assert _values(view) == [{"blur_kernel": 9}]
     view.settle()
     assert view.page.input_value(KERNEL) == "9"
+    assert view.text(".epypes-status") == "blur_kernel takes odd numbers: 8 became 9."
+    view.page.fill(KERNEL, "11")
+    view.press("Enter")
+    assert view.text(".epypes-status") == ""
 
 
 @pytest.mark.parametrize(

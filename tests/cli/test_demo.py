@@ -30,7 +30,7 @@ def test_the_demo_does_the_main_job_and_says_so(tutorial, tmp_path, straight_edg
     out = tmp_path / "out"
     done = run_cli("demo", tutorial, "--to", out)
     assert done.returncode == 0, done.stderr
-    for words in ("1/5", "5/5", "identical: 240000 values", "function canny", "graph overhead", "round trip"):
+    for words in ("1/5", "5/5", "identical: 240000 values", "function edges", "graph overhead", "round trip"):
         assert words in done.stdout
     assert "promoted" in done.stderr, "a progress display"
     assert np.array_equal(read_image(out / "edges.png"), straight_edges)

@@ -118,7 +118,7 @@ def test_bad_arguments_are_refused_with_a_sentence(grouped_runner, options, erro
 
 @pytest.mark.parametrize("shown", [None, 3, "graph", np.zeros(3), ep.CompGraph, ep.Pipeline])
 def test_what_can_not_be_shown_is_refused_with_what_can(shown):
-    with pytest.raises(TypeError, match="can be shown is a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"):
+    with pytest.raises(TypeError, match="draws a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"):
         ep.show(shown)
 
 

@@ -85,7 +85,7 @@ def test_tuples_are_ranges_and_lists_are_choices():
     ("settings", "words"),
     [
         ({"low": 3, "high": 1}, "Exchange them"),
-        ({"choices": ()}, "Name at least one"),
+        ({"choices": ()}, "There are no choices"),
         ({"step": 0}, "step must be positive"),
         ({"low": 0, "high": 1, "log": True}, "positive low"),
         ({"low": 2, "high": 2, "odd": True}, "no odd value"),

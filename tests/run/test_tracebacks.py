@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
-import subprocess
 import sys
 import traceback
 
 import pytest
 
 import epypes as ep
+from tests.ipython_cells import run_cells
 
 SETUP = """
 import cv2
@@ -59,29 +58,13 @@ CELLS = {
     "ep.CompGraph({'gray': gray}, {})": ("ep.CompGraph({'gray': gray}, {})", "has no io"),
     "pipe.set(kk=1)": ("pipe.set(kk=1)", "No token 'kk'"),
 }
-PROGRAM = """
-import contextlib, io, json, sys
-from IPython.core.interactiveshell import InteractiveShell
-
-setup, cells, mode = json.loads(sys.argv[1])
-shell = InteractiveShell.instance()
-shell.run_line_magic("colors", "nocolor")
-shell.run_line_magic("xmode", mode)
-assert shell.run_cell(setup).success
-shown = []
-for cell in cells:
-    with contextlib.redirect_stdout(io.StringIO()) as written:
-        assert not shell.run_cell(cell).success, cell
-    shown.append(written.getvalue())
-print("SHOWN", json.dumps(shown))
-"""
 
 
 def shown_in(mode):
-    arguments = [sys.executable, "-c", PROGRAM, json.dumps([SETUP, list(CELLS), mode])]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False, timeout=120)
-    assert not done.returncode, done.stderr
-    return dict(zip(CELLS, json.loads(done.stdout.partition("SHOWN ")[2]), strict=True))
+    setup, *shown = run_cells(SETUP, *CELLS, mode=mode)
+    assert setup.succeeded, setup.text
+    assert not any(each.succeeded for each in shown)
+    return {cell: each.text for cell, each in zip(CELLS, shown, strict=True)}
 
 
 def lines_of_frames(text):

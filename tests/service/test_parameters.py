@@ -74,7 +74,7 @@ def test_a_value_within_its_range_is_taken_as_the_kind_it_was(token, given, valu
         ("size", [[1], 2], "can't be"), ("kind", True, "There are: 1, 2"), ("open", 10, "up to 9"), ("sid", 5, "Did you mean 'side'"),
         ("sigma", {"value": 1}, "can't be"), ("sigma", 10**400, "can't be"), ("mask", 10**30, "can't be"),
         ("byte", 1.5, "whole number"), ("border", [2, 1], "There are"), ("mode", 3, "is a text"), ("table", {"a": 2}, "Promote"),
-        ("array", [1, 3], "Promote it anew"),
+        ("array", [1, 3], "Promote again"),
     ],
 )  # fmt: skip
 def test_a_value_that_cannot_be_is_refused_with_the_reason(token, given, text):

@@ -77,6 +77,7 @@ def test_a_list_of_functions_is_joined_by_the_names_of_their_parameters(
         ((0.0, 200.0), 100.0, 201.0),
         ((0, 255, 10), 100, 256),
         ([1, 2, 3], 1, 4),
+        (range(0, 256, 50), 100, 4),
         ({"few": 1, "many": 100}, 100, 2),
         (ep.Param(1, 31, odd=True), 31, 30),
         (ep.Param(0.001, 0.1, log=True), 0.1, 0.2),
@@ -148,6 +149,15 @@ def test_an_image_among_the_values_that_a_function_returns_is_shown(image: Any, 
     assert panel.result["count_2"] == count(image)[1]
 
 
+def test_a_dict_that_a_function_returns_is_shown_in_the_place_of_its_image(
+    image: Any, made: Callable[[Panel], Panel]
+) -> None:
+    def measures(image, level=100):
+        return {"share": float((image > level).mean())}
+
+    assert made(interact(measures, image)).token == "measures"
+
+
 def test_functions_can_be_tuned_on_several_images(image: Any, made: Callable[[Panel], Panel]) -> None:
     panel = made(tune([bright, above], images=[image, 255 - image], level=(0, 255), token="bright"))
     assert panel.values == {"gain": 2, "level": 127}
@@ -175,7 +185,7 @@ def plain(image: Any) -> Any:
         (lambda: interact(cv2.Canny, 1), GraphError, "no signature. Write a function"),
         (lambda: interact(plain, 1), ValueError, r"no parameter of 'plain' is left.*def f\(image, threshold=100\)"),
         (lambda: interact([], 1), ValueError, "No function is given"),
-        (lambda: interact("f", 1), GraphError, "can't be called"),
+        (lambda: interact("f", 1), GraphError, "A graph is made of functions, not of 'str'"),
         (lambda: interact(ep.Pipeline("p", ep.CompGraph.from_functions(plain)), 1), TypeError, r"tune\(runner\)"),
         (lambda: interact(blur_and_canny, None, low=3), ValueError, "'image' is None.*Was the file found"),
         (lambda: interact(blur_and_canny, 1, lov=(0, 9)), UnknownName, "No parameter 'lov'.*Did you mean 'low'"),

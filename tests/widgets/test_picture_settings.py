@@ -264,7 +264,7 @@ def test_code_changes_how_a_picture_is_shown_and_a_view_hears_of_it(panel: Panel
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"limits": (5, 5)}, "the lower one first"),
+        ({"limits": (5, 5)}, "the lower first"),
         ({"limits": (0, float("inf"))}, "two numbers"),
         ({"limits": 3}, "two numbers"),
         ({"colour_map": "pink"}, "one of gray, inverted, viridis"),

@@ -262,7 +262,7 @@ def test_a_failure_on_the_line_marks_its_function_until_an_event_completes(
     until(lambda: bool(panel.error))
     error = screen.last("error")
     assert error["function"] == "brighten"
-    assert error["text"].startswith("brighten: AttributeError: 'str' object has no")
+    assert error["text"].startswith("brighten: AttributeError: image is a text, not an image.")
     assert (screen.frames[-1]["stale"], screen.frames[-1]["stages"]["image_bright"]) == (True, "failed")
     assert panel.result is picture
     service.event(image=image)

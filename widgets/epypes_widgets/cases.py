@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from epypes.batch.check import CheckOutcome, CheckResult, Checks, prepare_cases, run_checks
 from epypes.batch.items import items_of, payload_of, read_value
-from epypes.errors import EpypesError, PayloadError, ScaleError
+from epypes.errors import EpypesError, InvalidType, PayloadError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 from epypes_widgets.history import History
@@ -156,7 +156,7 @@ def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:
     if cases is None:
         return ()
     if images is not None:
-        raise TypeError("tune() takes images or cases, not both: the inputs of the cases are the test images.")
+        raise InvalidType("tune() takes images or cases, not both: the inputs of the cases are the test images.")
     if not isinstance(runner, CompGraphRunner):
         free = runner.free_source_tokens
         raise PayloadError(free, "A service makes its own events, so it takes no cases. Check its bundle: ep.check().")
@@ -169,7 +169,7 @@ def read_cases(runner: Tunable, images: object, cases: Any) -> Checks:
     for item, (case, checks) in zip(items, prepared, strict=True):
         if item.frame is not None:
             text = f"{item.name} is a frame of a video, which a panel does not check. Give the video as images, or"
-            raise TypeError(f"{text} frames of it as inputs: ep.Case(video[17]); ep.check checks each frame.")
+            raise InvalidType(f"{text} frames of it as inputs: ep.Case(video[17]); ep.check checks each frame.")
         labels = {token: _label(value, runner, token) for token, value in (case.expected or {}).items()}
         with_labels = tuple(
             check if check.token is None else replace(check, expected=_label(check.expected, runner, check.token))

@@ -14,6 +14,7 @@ from operator import or_
 from typing import Any, Final
 
 from epypes.bundle.source.expressions import bracketed, literal_source
+from epypes.errors import InvalidValue
 from epypes_widgets.values import differing, listed
 
 # A longer text of one value is for a file, not for a line.
@@ -115,15 +116,15 @@ def _expression(value: Any) -> str:
     if isinstance(value, enum.Enum):
         parts = (value.name or "").split("|")  # the parts of a flag have names of their own
         if not type(value).__members__.keys() >= set(parts):
-            raise ValueError(f"{value!r} has no name")
+            raise InvalidValue(f"{value!r} has no name")
         return " | ".join(f"{type(value).__name__}.{part}" for part in parts)
     if type(value) in (tuple, list, dict):
         if len(value) > _MAX_CHARACTERS:
-            raise ValueError("too many items")
+            raise InvalidValue("too many items")
         return bracketed(value, _expression)
     text = _numpy_scalar(value) or literal_source(value) or (f'float("{value!r}")' if type(value) is float else "")
     if not text:
-        raise ValueError(f"no text makes a {type(value).__name__}")
+        raise InvalidValue(f"no text makes a {type(value).__name__}")
     return text
 
 

@@ -17,11 +17,11 @@ import ipywidgets
 from epypes.acquisition.frames import Frame, with_images
 from epypes.catalog import with_odd
 from epypes.display import is_image
-from epypes.errors import HyperparameterError, PayloadError, UnknownName
+from epypes.errors import HyperparameterError, InvalidType, InvalidValue, PayloadError, UnknownName
 from epypes.graph import CompGraph, annotated_params
 from epypes.graph.signature import signature_of
 from epypes.hints import Param, Roi, as_param
-from epypes.run import CompGraphRunner
+from epypes.run import CompGraphRunner, Run
 from epypes.run.guard import is_array
 from epypes_widgets.controls.ranges import allows
 from epypes_widgets.values import is_movable, listed
@@ -32,10 +32,11 @@ _ABBREVIATIONS: Final = "a range (low, high), a list of choices, an ep.Param, or
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A runner that was made of functions, and the hints of its hyperparameters."""
+    """A runner that was made of functions, the hints of its hyperparameters, and the token to show at first."""
 
     runner: CompGraphRunner
     hints: dict[str, Any]
+    token: str | None = None
 
 
 def are_functions(given: object) -> bool:
@@ -105,10 +106,11 @@ def made_runner(
             raise PayloadError(missing, f"{text} {_call(call, cg, tokens, [*values] or missing[:1], missing)}.")
     if not runner.hyperparameters:
         text = f"There is nothing to tune: no parameter {of} is left for a control. Give one a default, as in"
-        raise ValueError(f"{text} def f(image, threshold=100).")
-    if not has_images:
-        runner = _run(runner, with_images(values, cg))
-    return Made(runner, hints)
+        raise InvalidValue(f"{text} def f(image, threshold=100).")
+    if has_images:
+        return Made(runner, hints)
+    runner = _run(runner, with_images(values, cg))
+    return Made(runner, hints, None if runner.last is None else _shown_first(runner.last))
 
 
 def _run(runner: CompGraphRunner, payload: Mapping[str, Any]) -> CompGraphRunner:
@@ -128,18 +130,34 @@ def _run(runner: CompGraphRunner, payload: Mapping[str, Any]) -> CompGraphRunner
     return runner
 
 
+def _shown_first(run: Run) -> str | None:
+    """Return the token to show at first: a dict, where functions return nothing else; None leaves it to the panel.
+
+    Raises
+    ------
+    ValueError
+        The functions return None, and so there is nothing to show.
+    """
+    values = {token: run[token] for token in run.cg.sink_tokens}
+    if values and all(value is None for value in values.values()):
+        names = listed([repr(run.cg.digraph.producer[token]) for token in values])
+        text = f"There is nothing to show: {names} returned None."
+        raise InvalidValue(f"{text} A panel shows what functions return. End with: return image.")
+    return next(iter(values), None) if all(isinstance(value, dict) for value in values.values()) else None
+
+
 def _graph_of(functions: Any, call: str) -> CompGraph:
     each = functions if isinstance(functions, list | tuple) else (functions,)
     if any(hasattr(function, "cg") for function in each):
-        raise TypeError(f"{call}() takes functions here, not {type(each[0]).__name__!r}. A runner: tune(runner).")
+        raise InvalidType(f"{call}() takes functions here, not {type(each[0]).__name__!r}. A runner: tune(runner).")
     if not each:
-        raise ValueError(f"No function is given. Call {call}([blur, edges], ...) with one at least.")
+        raise InvalidValue(f"No function is given. Call {call}([blur, edges], ...) with one at least.")
     for function in each:
         for parameter in _parameters(function).values():
             if parameter.kind is parameter.VAR_POSITIONAL:
                 name = getattr(function, "__name__", "A function")
                 text = f"{name!r} takes *{parameter.name}: the names of those parameters are not known."
-                raise TypeError(f"{text} Write a function (def) that names each of them.")
+                raise InvalidType(f"{text} Write a function (def) that names each of them.")
     return CompGraph.from_functions(*each)
 
 
@@ -160,7 +178,7 @@ def _require_parameters(cg: CompGraph, tokens: Sequence[str], given: Iterable[st
             parameter = _parameters(function).get(name)
             if parameter is not None and parameter.kind is parameter.KEYWORD_ONLY:
                 text = f"Parameter {name!r} of {function.__name__!r} is given by its name only, and a graph gives all"
-                raise TypeError(f"{text} by position. Take the '*' before it out of the signature.")
+                raise InvalidType(f"{text} by position. Take the '*' before it out of the signature.")
         raise UnknownName("parameter", name, tokens, of)
 
 
@@ -168,7 +186,7 @@ def _require_images(values: Mapping[str, Any], cg: CompGraph) -> None:
     for token, value in values.items():
         if value is None and cg.defaults.get(token, _ABSENT) is not None:
             text = f"{token!r} is None, which is no image. Was the file found?"
-            raise ValueError(f"{text} cv2.imread gives None for one that it can't read: check the path.")
+            raise InvalidValue(f"{text} cv2.imread gives None for one that it can't read: check the path.")
 
 
 def _call(call: str, cg: CompGraph, tokens: Sequence[str], payload: Sequence[str], missing: Sequence[str]) -> str:
@@ -185,16 +203,16 @@ def _meant(cg: CompGraph, name: str, given: Any) -> tuple[Any, bool]:
         return given.value, True
     if isinstance(given, ipywidgets.Widget):
         text = f"{name!r} is a widget ({type(given).__name__}), and a panel makes its own."
-        raise TypeError(f"{text} Give {_ABBREVIATIONS}.")
+        raise InvalidType(f"{text} Give {_ABBREVIATIONS}.")
     if is_array(given) or isinstance(given, Frame):
         return given, True
     try:
         hint = as_param(given)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"Hint of {name!r}: {error}") from error
+        raise InvalidValue(f"Hint of {name!r}: {error}") from error
     if isinstance(hint, Param) and isinstance(given, tuple) and hint.low == hint.high:
         text = f"Hint of {name!r}: there is one value in the range {given!r}, so there is nothing to move."
-        raise ValueError(f"{text} Give another end. If the tuple is meant itself: ipywidgets.fixed({given!r}).")
+        raise InvalidValue(f"{text} Give another end. If the tuple is meant itself: ipywidgets.fixed({given!r}).")
     if isinstance(hint, Param):
         hint = with_odd(given, hint, cg, name)
     return given if hint is None else hint, False

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epypes.display import reset_display_ranges
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, InvalidValue
 from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.cases import Cases
@@ -173,7 +173,7 @@ class Messages:
             name = str(message["name"]).strip()
             if ".." in Path(name).parts:
                 way_out = f"Name them {Path(name).name!r}; panel.save(path) and panel.load(path) take any path."
-                raise ValueError(f"{name!r} has '..' in it, which leads out of a folder. {way_out}")
+                raise InvalidValue(f"{name!r} has '..' in it, which leads out of a folder. {way_out}")
             text, is_done = act(name), True
         except (EpypesError, ValueError) as error:
             text, is_done = str(error), False

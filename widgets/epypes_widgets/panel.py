@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import ipywidgets
 
 from epypes.batch.check import CheckResult, Checks
-from epypes.errors import NotComputed, PayloadError, ServiceError, run_call
+from epypes.errors import InvalidType, NotComputed, PayloadError, ServiceError, run_call
 from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
 from epypes.store import Store
@@ -121,7 +121,7 @@ class Panel(Displayed):
             A service is tuned, whose runner is in its worker process.
         """
         if not isinstance(self._runner, CompGraphRunner):
-            raise TypeError("A service is tuned, so there is no runner here. Ask what ep.connect has returned.")
+            raise InvalidType("A service is tuned, so there is no runner here. Ask what ep.connect has returned.")
         return self._runner
 
     @property
@@ -345,7 +345,7 @@ class Panel(Displayed):
             The service is gone, refuses a value or the changed bundle.
         """
         if isinstance(self._runner, CompGraphRunner):
-            raise TypeError("A runner has no bundle to write to. Promote it: ep.promote(runner, folder).")
+            raise InvalidType("A runner has no bundle to write to. Promote it: ep.promote(runner, folder).")
         if self._session.is_wanting and not self._tuning.is_live:
             self._tuning.run()
         self.wait(timeout_s)
@@ -468,7 +468,7 @@ def interact(functions: Any, /, *payload: Any, **abbreviations: Any) -> Panel:
     ------
     GraphError, TypeError, ValueError, UnknownName, PayloadError
         The functions can't be tuned, such as a lambda or one with ``*args``; a parameter has no value; a keyword is for
-        no parameter; the image is None. Each says the way out.
+        no parameter; the image is None, or what the functions return. Each says the way out.
     Exception
         Whatever a function raises on the first run.
 
@@ -576,6 +576,8 @@ def tune(
     runner, hints = (tuned.runner, tuned.hints) if isinstance(tuned, Made) else (tunable(tuned), hints)
     if token is not None:
         runner.cg.require_token(token)
+    elif isinstance(tuned, Made):
+        token = tuned.token
     found = read_cases(runner, images, cases)
     if found:
         given = payloads(runner, [case.inputs for case, _ in found], [case.name or "" for case, _ in found])

@@ -14,7 +14,7 @@ from epypes.batch.contact_sheet import Sheet, Tile, sheet_page, shown_tokens
 from epypes.batch.grid import identity
 from epypes.batch.mapping import SweepResult
 from epypes.display.text import cut
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, InvalidType
 from epypes_widgets.picture.static import Displayed, StaticOutput
 from epypes_widgets.values import is_same, setting_text
 from epypes_widgets.view import script, styles, use_subshell
@@ -57,7 +57,7 @@ def pick(result: SweepResult, token: str | None = None, rows: str | None = None,
         As ``result.sheet`` does.
     """
     if not isinstance(result, SweepResult):
-        raise TypeError(f"pick takes what ep.sweep has returned, not {type(result).__name__!r}: pick(ep.sweep(...)).")
+        raise InvalidType(f"pick takes what ep.sweep has returned, not {type(result).__name__!r}: pick(ep.sweep(...)).")
     return Picker(result, result.sheet(token, rows, columns))
 
 

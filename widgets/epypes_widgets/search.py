@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.errors import EpypesError, ScaleError
+from epypes.errors import EpypesError, InvalidType, ScaleError
 from epypes.hints import Param
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
@@ -64,7 +64,7 @@ class Search:
     ) -> None:
         if not isinstance(runner, CompGraphRunner):
             text = "metric is for a runner: a running service has one image at a time. Optimise where it was made."
-            raise TypeError(text)
+            raise InvalidType(text)
         self.result: OptimizeResult | None = None
         self.report: Callable[[], None] = lambda: None
         self._runner, self._metric, self._direction = runner, metric, direction

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import is_, is_not
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from epypes.errors import InvalidType
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets.picture.frame_states import FrameStates
 from epypes_widgets.picture.images import Payloads, is_alike
@@ -35,10 +36,11 @@ def tunable(given: object) -> Tunable:
     """
     found: Any = given.to_tune() if hasattr(given, "to_tune") else given
     if not isinstance(found, CompGraphRunner) and not hasattr(found, "connection"):
-        raise TypeError(
-            f"tune() takes a CompGraphRunner, a connection to a service, or functions, not {type(given).__name__!r}: "
-            "tune(CompGraphRunner(cg, hparams)), tune(ep.connect(url)), tune(function, image=image)."
-        )
+        text = f"tune() takes a CompGraphRunner, a connection to a service, or functions, not {type(given).__name__!r}."
+        way_out = "Call tune(runner), tune(ep.connect(url)) or tune(function, image=image)."
+        if isinstance(given, Run):
+            way_out = "Give the runner that made the run: tune(runner)."
+        raise InvalidType(f"{text} {way_out}")
     tuned: Tunable = found
     return tuned
 

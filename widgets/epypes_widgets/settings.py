@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from epypes.bundle.settings import decode_value, encode_value, fits
 from epypes.catalog import plain
-from epypes.errors import SettingsError, UnknownName
+from epypes.errors import InvalidValue, SettingsError, UnknownName
 from epypes.hints import Param
 from epypes.optional import optional_import
 from epypes_widgets.controls.ranges import range_text
@@ -274,20 +274,20 @@ def _value(entry: Any, token: str, present: Any) -> Any:
             return _member(entry["value"], token, present)
         value = decode_value(entry) if isinstance(entry, dict) else entry
     except (KeyError, TypeError) as error:
-        raise ValueError(f"Hyperparameter {token!r} is a table without a value.") from error
+        raise InvalidValue(f"Hyperparameter {token!r} is a table without a value.") from error
     if not fits(value):
-        raise ValueError(f"Hyperparameter {token!r} is {value!r:.60}, which is no value that a panel saves.")
+        raise InvalidValue(f"Hyperparameter {token!r} is {value!r:.60}, which is no value that a panel saves.")
     return _scalar(value, token, present) if numpy_type(present) is not None else value
 
 
 def _member(name: Any, token: str, present: Any) -> enum.Enum:
     if not isinstance(present, enum.Enum):
-        raise ValueError(
+        raise InvalidValue(
             f"Hyperparameter {token!r} is a member of an enumeration in the file, and {present!r:.40} now."
         )
     known = type(present).__members__
     if name not in known:
-        raise ValueError(str(UnknownName("member", name, known, f"of {type(present).__name__}, for {token!r}")))
+        raise InvalidValue(str(UnknownName("member", name, known, f"of {type(present).__name__}, for {token!r}")))
     return known[name]
 
 
@@ -301,5 +301,5 @@ def _scalar(value: Any, token: str, present: Any) -> Any:
     except (OverflowError, ValueError, TypeError, Warning):  # a number too large is a warning of NumPy 1
         is_held = False
     if not is_held:
-        raise ValueError(f"Hyperparameter {token!r} can't be {value!r:.40}: it is a {kind.__name__}.")
+        raise InvalidValue(f"Hyperparameter {token!r} can't be {value!r:.40}: it is a {kind.__name__}.")
     return restored

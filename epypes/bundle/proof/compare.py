@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from epypes.errors import InvalidType
 from epypes.optional import optional_import
 from epypes.wire.encoder import set_sort_key
 from epypes.wire.opencv import FIELDS, record_fields, record_type
@@ -291,6 +292,6 @@ def read_tolerances(document: Mapping[str, Any]) -> dict[str, Tolerance]:
     for token, entry in document.get("tolerance", {}).items():
         bounds = (entry["absolute"], entry["relative"])
         if not all(type(bound) in (int, float) and 0 <= bound < math.inf for bound in bounds):
-            raise TypeError(f"the tolerance of {token!r} is {bounds!r}, not two numbers of 0 or more")
+            raise InvalidType(f"the tolerance of {token!r} is {bounds!r}, not two numbers of 0 or more")
         found[token] = Tolerance(*map(float, bounds))
     return found

@@ -31,6 +31,7 @@ from epypes.bundle.private_import import import_module, loaded_module, plain_nam
 from epypes.bundle.proof.compare import exact_text
 from epypes.bundle.source.expressions import has_steady_order
 from epypes.bundle.source.references import defaults_of, imported_modules, meanings_of, nested_codes, reads_of
+from epypes.errors import InvalidType
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner
@@ -355,7 +356,7 @@ def _library_object(value: Any) -> Description:
         module = getattr(value, "__module__", None)
         module = module or next((home for home in [*sys.modules] if _found(home, made) is value), "")
         if _found(module, made) is not value:
-            raise TypeError(f"{made!r} can't be found in {module!r}")
+            raise InvalidType(f"{made!r} can't be found in {module!r}")
         return Description("global", (module, made), module=module)
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]
     parts = [(" class", kind), (" maker", by), (" arguments", arguments), (" state", _without_computed(kind, state))]

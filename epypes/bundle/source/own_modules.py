@@ -60,6 +60,7 @@ from epypes.bundle.source.side_effects import (
     imported_by,
     patches_in,
 )
+from epypes.errors import InvalidValue
 from epypes.run.guard import is_plain_array
 
 _PYTHON: Final = Path(os.__file__).resolve().parent
@@ -449,7 +450,7 @@ def _evaluated(node: ast.AST, names: Mapping[str, Any]) -> Any:
             return "".join(_evaluated(value, names) for value in values)
         case ast.Call(keywords=[]):
             return _called(node, [_evaluated(argument, names) for argument in node.args], names)
-    raise ValueError("no path")
+    raise InvalidValue("no path")
 
 
 def _called(node: ast.Call, arguments: list[Any], names: Mapping[str, Any]) -> Any:
@@ -461,7 +462,7 @@ def _called(node: ast.Call, arguments: list[Any], names: Mapping[str, Any]) -> A
     home = str(getattr(function, "__module__", ""))
     is_reader = home.startswith(("importlib.resources", "pkgutil")) and function.__name__ in _RESOURCE_READERS
     if not is_reader and not any(function is one for one in _PATH_FUNCTIONS):
-        raise ValueError("no function for paths")
+        raise InvalidValue("no function for paths")
     if is_reader or function is importlib.resources.files:
         package, *parts = arguments
         if isinstance(node.args[0], ast.Constant) and not is_installed(package):

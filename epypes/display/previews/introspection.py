@@ -15,6 +15,8 @@ from contextvars import ContextVar
 from types import FunctionType, GetSetDescriptorType, MappingProxyType, MemberDescriptorType, SimpleNamespace
 from typing import Any, Final
 
+from epypes.errors import InvalidType
+
 # The name of a class, its name within its module, and the class with its parents in the order in which Python asks
 # them. These never raise, whatever a metaclass says.
 kind_name: Final[Callable[[type], str]] = type.__dict__["__name__"].__get__
@@ -93,7 +95,7 @@ def items_in(value: Any) -> Iterator[Any]:
     """Return the items of a list, tuple, set or deque, or of what is of a subclass."""
     known = _first_of(_ITERABLE, value)
     if known is None:
-        raise TypeError(f"the items of {kind_name(type(value))} are not known")
+        raise InvalidType(f"the items of {kind_name(type(value))} are not known")
     found: Iterator[Any] = known.__iter__(value)
     return found
 
@@ -102,7 +104,7 @@ def pairs_in(value: Any) -> Iterator[tuple[Any, Any]]:
     """Return the keys and values of a dict, or of what is of a subclass."""
     known = _first_of(_MAPPINGS, value)
     if known is None:
-        raise TypeError(f"the items of {kind_name(type(value))} are not known")
+        raise InvalidType(f"the items of {kind_name(type(value))} are not known")
     return iter(known.items(value))
 
 

@@ -43,6 +43,7 @@ from epypes.display.previews.introspection import (
 )
 from epypes.display.previews.short import reason
 from epypes.display.text import cut
+from epypes.errors import InvalidType, InvalidValue
 from epypes.images import Order
 from epypes.nothing import NothingType
 from epypes.optional import LazyModule
@@ -110,7 +111,7 @@ def _function_of(kind: type) -> PreviewFunction:
         found = users_functions.get(parent) or _BUILT_IN.get(parent) or _BUILT_IN.get(dotted_name(parent))
         if found is not None:
             return found
-    raise TypeError(f"nothing is registered for {kind_name(kind)}")
+    raise InvalidType(f"nothing is registered for {kind_name(kind)}")
 
 
 def is_shown_by_user(kind: type) -> bool:
@@ -154,11 +155,11 @@ def register_preview(kind: type | str, function: Callable[[Any], Any] | None = N
     ...     return f"x = {pose.x}"
     """
     if not isinstance(kind, type) and not (isinstance(kind, str) and "." in kind):
-        raise TypeError(f"A preview is registered for a class or its dotted name, 'module.Class', not {kind!r}.")
+        raise InvalidType(f"A preview is registered for a class or its dotted name, 'module.Class', not {kind!r}.")
     if function is None:
         return lambda given: register_preview(kind, given)
     if not callable(function):
-        raise TypeError(f"The preview of {kind!r} must be a function that takes the value, not {function!r:.60}.")
+        raise InvalidType(f"The preview of {kind!r} must be a function that takes the value, not {function!r:.60}.")
 
     def by_user(value: Any, look: Look) -> Any:
         with users_code():
@@ -264,7 +265,7 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
         detail = f"{_kind(value)}, shown as {image.shown.detail}"
         shown = _trimmed(replace(image.shown, text=_kind(value), detail=detail))
         return replace(image, shown=shown, is_image=False)
-    raise TypeError(f"a preview must be a text, an image or an ep.Preview, not {_kind(found)}")
+    raise InvalidType(f"a preview must be a text, an image or an ep.Preview, not {_kind(found)}")
 
 
 def _trimmed(shown: Preview) -> Preview:
@@ -272,7 +273,7 @@ def _trimmed(shown: Preview) -> Preview:
     rows = tuple(itertools.islice(shown.rows, _MOST_ROWS))
     for line in (shown.text, shown.detail, *rows):
         if not issubclass(type(line), str):
-            raise TypeError("text, detail and rows of a preview must be texts")
+            raise InvalidType("text, detail and rows of a preview must be texts")
     text = cut(plain_text(shown.text)[:500], _TEXT_CHARACTERS)
     short = [plain_text(row)[:_ROW_CHARACTERS] for row in rows]
     lines = ["".join(mark if mark.isprintable() else " " for mark in row) for row in short]
@@ -284,7 +285,7 @@ def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | Non
     """Return what draws the picture or chart that a user's preview has."""
     if picture is not None:
         if not issubclass(type(picture), Picture):
-            raise TypeError("picture must be an image: an array of at least 8 x 8 pixels")
+            raise InvalidType("picture must be an image: an array of at least 8 x 8 pixels")
         return lambda most_bytes: _checked_picture(picture, most_bytes)
     if chart is None:
         return None
@@ -295,7 +296,7 @@ def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | Non
 def _checked_chart(chart: Any) -> Chart:
     """Return a chart within the limits: of finite points, each between 0 and 1."""
     if type(chart) is not Chart or chart.kind not in _CHARTS:
-        raise TypeError(f"chart of a preview must be a Chart of kind {', '.join(_CHARTS)}")
+        raise InvalidType(f"chart of a preview must be a Chart of kind {', '.join(_CHARTS)}")
     room, series = MOST_POINTS, []
     for points in itertools.islice(chart.series, MOST_POINTS):
         pairs = [(float(x), float(y)) for x, y in itertools.islice(points, room)]
@@ -309,7 +310,7 @@ def _checked_picture(picture: Picture, most_bytes: int) -> Picture:
     """Return a picture within the limits of a thumbnail; what it is, its bytes decide."""
     with Image.open(io.BytesIO(picture.data), formats=["PNG", "JPEG"]) as opened:
         if opened.width * opened.height > _MOST_PIXELS:
-            raise ValueError(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
+            raise InvalidValue(f"a picture of {opened.width} x {opened.height} is too large for a thumbnail")
         # What is broken is found by decoding it.
         opened.load()
         if max(opened.size) <= THUMBNAIL_PX and len(picture.data) <= most_bytes:

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from epypes.display.layout import Direction as Direction
 from epypes.display.previews import Chart, Picture, Preview
+from epypes.errors import InvalidType
 from epypes.images import Order
 
 # For each vertex.
@@ -209,7 +210,7 @@ def from_json(written: Mapping[str, Any]) -> GraphView:
         This is not a view.
     """
     if not isinstance(written, Mapping):
-        raise TypeError(f"A view in JSON is an object, not {type(written).__name__!r}.")
+        raise InvalidType(f"A view in JSON is an object, not {type(written).__name__!r}.")
     graph: GraphView = _read(written, GraphView)
     return graph
 
@@ -246,7 +247,7 @@ def _read(written: Any, record: type | None) -> Any:
     if record is None or written is None:
         return written
     if not isinstance(written, Mapping):
-        raise TypeError(f"A {record.__name__} in JSON is an object, not {type(written).__name__!r}.")
+        raise InvalidType(f"A {record.__name__} in JSON is an object, not {type(written).__name__!r}.")
     if record is Picture:
         media_type, _, data = written["uri"].removeprefix("data:").partition(";base64,")
         return Picture(base64.b64decode(data), media_type, written["width"], written["height"])

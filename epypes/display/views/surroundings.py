@@ -23,6 +23,7 @@ from epypes.display.previews.features import are_keypoints, no_marks
 from epypes.display.previews.images import Range, display_range, image_kind, is_image, own_range, sampled
 from epypes.display.previews.introspection import is_of, kind_name
 from epypes.display.previews.preview import scene_in, sketch
+from epypes.errors import InvalidType
 from epypes.graph import colour_order
 from epypes.graph.identity import innermost
 from epypes.run import CompGraphRunner, Run
@@ -77,7 +78,7 @@ def reset_display_ranges(shown: Any, token: str | None = None) -> None:
             if token is not None:
                 _ranges[run.tokens.program] = {key: ends for key, ends in kept.items() if key[0] != token}
     elif not isinstance(runner, CompGraphRunner):
-        raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
+        raise InvalidType(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
 
 
 # -- what a token was made from ------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, get_args
 
+from epypes.display.previews.images import is_image
 from epypes.display.previews.short import reason
 from epypes.display.text import (
     CHARACTERS_OF_A_VERTEX,
@@ -26,7 +27,7 @@ from epypes.display.views.pipelines import Inside, insides_of
 from epypes.display.views.pipelines import opened as with_inside
 from epypes.display.views.structure import structure_of
 from epypes.display.views.tokens import ROOM, HyperparameterValues, Room, token_views
-from epypes.errors import UnknownName, run_call
+from epypes.errors import InvalidType, InvalidValue, UnknownName, run_call
 from epypes.graph import CompGraph, names_of
 from epypes.run import CompGraphRunner, FunctionTime, Plan, Run
 from epypes.run.plan import chosen_branches, wanted_steps
@@ -96,15 +97,15 @@ def view(
 
 def _require_options(direction: object, thumbnails: object, collapse: object, depth: object) -> None:
     if not isinstance(direction, str) or direction not in get_args(Direction):
-        raise ValueError(f'direction must be "down" or "right", not {direction!r:.60}.')
+        raise InvalidValue(f'direction must be "down" or "right", not {direction!r:.60}.')
     if isinstance(thumbnails, bool) or not isinstance(thumbnails, int):
-        raise TypeError(f"thumbnails must be a number, of how many there are at most, not {thumbnails!r:.60}.")
+        raise InvalidType(f"thumbnails must be a number, of how many there are at most, not {thumbnails!r:.60}.")
     if thumbnails < 0:
-        raise ValueError(f"thumbnails must be 0 or more, not {thumbnails}.")
+        raise InvalidValue(f"thumbnails must be 0 or more, not {thumbnails}.")
     if not isinstance(collapse, bool):
-        raise TypeError(f"collapse must be True or False, not {collapse!r:.60}; open=[...] names groups.")
+        raise InvalidType(f"collapse must be True or False, not {collapse!r:.60}; open=[...] names groups.")
     if isinstance(depth, bool) or not isinstance(depth, int) or depth < 0:
-        raise ValueError(f"depth is how many levels of pipelines are drawn open, 0 or more, not {depth!r:.60}.")
+        raise InvalidValue(f"depth is how many levels of pipelines are drawn open, 0 or more, not {depth!r:.60}.")
 
 
 def _graph_of(shown: Any) -> CompGraph:
@@ -118,8 +119,9 @@ def _graph_of(shown: Any) -> CompGraph:
     except Exception:  # an attribute of a user's class may do anything
         runner = None
     if not isinstance(runner, CompGraphRunner) or isinstance(shown, type):
-        text = "What can be shown is a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"
-        raise TypeError(f"{text}, not {type(shown).__name__!r}.")
+        text = "ep.show() draws a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"
+        way_out = " An image is in the picture of its run: ep.show(runner.run(...))." * is_image(shown)
+        raise InvalidType(f"{text}, not {type(shown).__name__!r}.{way_out}")
     return runner.cg
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from epypes.bundle.arrays import StoredArray
 from epypes.bundle.settings import decode_value
+from epypes.errors import InvalidValue
 from epypes.service.supervision.packing import unpack_state
 
 # The topic of the events that publish failures.
@@ -138,16 +139,16 @@ def read_record(entries: Any) -> FailedEvent:
         An entry has another type than a record's, or there is no id.
     """
     if not isinstance(entries, Mapping):
-        raise ValueError(f"a record is an object, not {type(entries).__name__}")
+        raise InvalidValue(f"a record is an object, not {type(entries).__name__}")
     given: dict[str, Any] = {}
     for name, like in _EMPTY.items():
         value = entries.get(name, like)
         if not isinstance(value, (list, tuple) if isinstance(like, tuple) else type(like)):
-            raise ValueError(f"{name!r} is {value!r:.40}")
+            raise InvalidValue(f"{name!r} is {value!r:.40}")
         given[name] = tuple(map(str, value)) if isinstance(like, tuple) else value
     record = FailedEvent(**given)
     if not ID.fullmatch(record.id):
-        raise ValueError(f"{record.id!r:.40} is no id of a failure")
+        raise InvalidValue(f"{record.id!r:.40} is no id of a failure")
     return record
 
 

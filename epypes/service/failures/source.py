@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from epypes.bundle.manifest import check_manifest
-from epypes.errors import BundleError, FailureNotKept, ServiceError, UnknownName
+from epypes.errors import BundleError, FailureNotKept, InvalidType, ServiceError, UnknownName
 from epypes.service.failures.record import FAILURE_TOPIC, FailedEvent, read_record
 from epypes.service.failures.store import FailureStore, failures_folder
 
@@ -130,7 +130,7 @@ def _connected(source: Any) -> Connection:
         return connect(source)
     if not isinstance(source, Connection):
         text = f"Failures come from a bundle's path, a service's http URL or ep.connect(url), not {source!r:.80}."
-        raise TypeError(text)
+        raise InvalidType(text)
     return source
 
 

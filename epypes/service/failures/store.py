@@ -20,7 +20,7 @@ from pathlib import Path
 from time import monotonic, time
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.errors import EpypesError, FailureNotKept, MessageError, UnknownName
+from epypes.errors import EpypesError, FailureNotKept, InvalidValue, MessageError, UnknownName
 from epypes.service.failures.record import ID, FailedEvent, read_record, with_id
 from epypes.store.writer import BackgroundWriter
 from epypes.transport.throttle import Throttle
@@ -286,7 +286,7 @@ class FailureStore:
                 state = file.read(record.state_bytes) if with_event else b""
                 packed = file.read() if with_event else b""
             if record.id != failure_id:
-                raise ValueError(f"it is the record of {record.id}")
+                raise InvalidValue(f"it is the record of {record.id}")
         except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
             raise _damaged(failure_id, path, error) from error
         return record, state, packed

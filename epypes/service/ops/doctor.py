@@ -22,7 +22,7 @@ from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.manifest import check_manifest
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, install_command
 from epypes.service.state_file import read_states, state_file
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _extra(extra: str) -> Check:
         else:
             missing.append(f"{one.name}{one.specifier} (is {version})")
     if missing:
-        way_out = f"pip install 'epypes[{extra}]', if you need it."
+        way_out = f"{install_command(extra)}, if you need it."
         return Check(f"extra {extra}", "warning", f"missing: {', '.join(missing)}", way_out)
     return Check(f"extra {extra}", "ok", ", ".join(found))
 
@@ -154,7 +154,7 @@ def _required(extra: str) -> dict[str, Requirement]:
 def _opencv() -> Check:
     twins = [name for name in metadata.packages_distributions().get("cv2", ()) if name]
     if not twins:
-        return Check("OpenCV", "warning", "not installed", "pip install 'epypes[vision]', if you need it.")
+        return Check("OpenCV", "warning", "not installed", f"{install_command('vision')}, if you need it.")
     found = ", ".join(f"{name} {metadata.version(name)}" for name in sorted(set(twins)))
     if len(set(twins)) > 1:
         way_out = "They overwrite each other's files. Uninstall all of them, then install the one that you want."
@@ -171,7 +171,7 @@ def _graphviz() -> Check:
     try:
         routed_layout([Box("box", 40, 20), Box("ellipse", 40, 20)], [(0, 1)], frozenset())
     except EpypesError as error:
-        way_out = "pip install 'epypes[graphviz]', or your system's package graphviz, if you want graphs drawn."
+        way_out = f"{install_command('graphviz')}, or your system's package graphviz, if you want graphs drawn."
         return Check("Graphviz", "warning", str(error), way_out)
     return Check("Graphviz", "ok", f"lays out by {engine}")
 

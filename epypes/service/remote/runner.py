@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.errors import (
     EpypesError,
     HyperparameterError,
+    InvalidValue,
     NotComputed,
     ParametersRefused,
     PayloadError,
@@ -205,7 +206,7 @@ class RemoteRunner:
             The run is not that of the last trial.
         """
         if self._trial is None or self._trial[0] is not run:
-            raise ValueError("Only the run that this runner's trial() returned last can be adopted.")
+            raise InvalidValue("Only the run that this runner's trial() returned last can be adopted.")
         _, values, is_whole = self._trial
         if is_whole:
             now = self._runs.values(self._parameters)

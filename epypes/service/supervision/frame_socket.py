@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, get_args
 
-from epypes.errors import MessageError
+from epypes.errors import InvalidValue, MessageError
 from epypes.service.supervision.packing import HEAD, MARK, BytesLike, table_of
 
 MessageKind = Literal["event", "parameters", "withdraw", "query", "end", "ready", "refused", "done", "answer"]
@@ -86,7 +86,7 @@ def _decode(head: BytesLike, frames: Sequence[BytesLike] = ()) -> WorkerMessage:
         text = str(head[_KIND_AND_NUMBER.size :], "utf-8")
         content = _from_json(text) if text else {}
         if not isinstance(content, dict):
-            raise ValueError(f"an object is expected, not a {type(content).__name__}")
+            raise InvalidValue(f"an object is expected, not a {type(content).__name__}")
         return WorkerMessage(_KINDS[kind], number, content, frames)
     except (struct.error, IndexError, ValueError, RecursionError) as error:
         raise MessageError("no message", f"The head of a message can't be read: {error}.") from error

@@ -25,7 +25,7 @@ from typing import Final
 
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.bundle.proof.replay import replay
-from epypes.errors import EpypesError
+from epypes.errors import EpypesError, InvalidValue
 from epypes.pipeline import Pipeline
 from epypes.run import Failure
 from epypes.service.supervision.frame_socket import ControlSocket, FrameSocket, WorkerMessage
@@ -102,7 +102,7 @@ class Worker:
         if message.kind == "withdraw":
             self._inputs.withdraw(message)
         elif message.kind != "query":
-            raise ValueError(f"The front has sent a message of kind {message.kind!r}.")
+            raise InvalidValue(f"The front has sent a message of kind {message.kind!r}.")
         elif message.content["what"] == "running":
             # At once: the front asks when something takes too long, which may be another query.
             slots = [found for slot in self._slots if (found := slot.running)]

@@ -23,9 +23,12 @@ test("a fraction is no whole number", () => assert.match(read(odd, 0, "2.5").pro
 test("the ends are told", () => assert.match(read(row(), 0, "11").problem, /its range is 0 to 10/));
 test("an open end is not told", () => assert.match(read(row({ high: [null] }), 0, "-1").problem, /at least 0/));
 test("an open end takes anything", () => assert.deepEqual(read(row({ high: [null] }), 0, "1e9"), { value: 1e9 }));
-test("an even number becomes the next odd one", () => assert.deepEqual(read(odd, 0, "8"), { value: 9 }));
+test("an odd number is taken without a word", () => assert.deepEqual(read(odd, 0, "9"), { value: 9 }));
+test("an even number becomes the next odd one, and a notice says so", () => {
+  assert.deepEqual(read(odd, 0, "8"), { value: 9, notice: "x takes odd numbers: 8 became 9." });
+});
 test("an even number at an even end becomes the odd one below", () => {
-  assert.deepEqual(read({ ...odd, high: [30] }, 0, "30"), { value: 29 });
+  assert.equal(read({ ...odd, high: [30] }, 0, "30").value, 29);
 });
 test("the lower value of a pair stays below the upper one", () => {
   assert.match(read(pair, 0, "201", [70, 200]).problem, /0 to 200 \(hi\)/);

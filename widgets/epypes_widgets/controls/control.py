@@ -18,7 +18,7 @@ from ipywidgets.widgets.widget_int import SliderStyle
 from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 
 from epypes.display.previews.short import short_repr
-from epypes.errors import UnknownName
+from epypes.errors import InvalidValue, UnknownName
 from epypes.graph import CompGraph, inside_of
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.controls.ranges import Range, allows, ranges
@@ -337,7 +337,7 @@ class RangeControl(Control):
             text = (
                 f"{name!r} can't be {short_repr(value)}: it is never {never} {other!r}, which is {short_repr(bound)}."
             )
-            raise ValueError(f"{text} Set {other!r} first, or both at once.")
+            raise InvalidValue(f"{text} Set {other!r} first, or both at once.")
         return found
 
     def _place(self, values: Mapping[str, Any]) -> None:
@@ -483,7 +483,7 @@ class LineControl(SingleControl):
         if isinstance(param, Roi):
             if not allows(param, value):
                 way_out = "Give (x, y, width, height) in whole pixels, none of them negative."
-                raise ValueError(f"{self.names[0]!r} can't be {short_repr(value)}: it is a rectangle. {way_out}")
+                raise InvalidValue(f"{self.names[0]!r} can't be {short_repr(value)}: it is a rectangle. {way_out}")
             return (list if isinstance(self._exact, list) else tuple)(map(int, value))
         if not allows(param, value):
             raise refused(self.names[0], value, param)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from epypes.catalog import entry_of, fits, parameter_names, range_of, uses, usual, with_odd
-from epypes.errors import UnknownName
+from epypes.errors import InvalidType, InvalidValue, UnknownName
 from epypes.graph import CompGraph, annotated_params, as_switch, inner_graph, inside_of
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
 from epypes_widgets.values import as_python, is_integer, is_movable
@@ -164,14 +164,14 @@ def _read(runner: Tunable, name: str, hint: Any) -> Param | Roi:
     try:
         param = as_param(hint)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"Hint of {name!r}: {error}") from error
+        raise InvalidValue(f"Hint of {name!r}: {error}") from error
     if param is None:
-        raise TypeError(
+        raise InvalidType(
             f"Hint of {name!r} is {hint!r:.60}. Give an ep.Param, a tuple as a range (low, high), a list or dict of "
             "choices, or an ep.Roi."
         )
     if not allows(param, value):
-        raise ValueError(
+        raise InvalidValue(
             f"{name!r} is {value!r:.60}, outside of its hint ({range_text(param)}). "
             f"Set runner[{name!r}] to a value inside, or widen the hint."
         )
@@ -312,7 +312,7 @@ def _paired(runner: Tunable | _Part, found: Mapping[str, Range], given: Mapping[
             taken |= {low, high}
             ranges[low] = replace(param, below=high)
         elif low in given:
-            raise ValueError(
+            raise InvalidValue(
                 f"{low!r} ({values[low]!r:.60}) is hinted to stay below {high!r} ({values[high]!r:.60}). Both must be "
                 "numbers of one type, in order, and in no other pair. Set them so, or leave below out."
             )

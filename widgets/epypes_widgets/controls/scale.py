@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from epypes.display.previews.short import short_repr
+from epypes.errors import InvalidValue
 from epypes.hints import Param, odd_step
 from epypes_widgets.controls.ranges import allows, range_text
 from epypes_widgets.values import is_integer, is_number, numpy_type
@@ -83,10 +84,11 @@ class Scale:
             It takes no such value.
         """
         if not is_number(value):
-            raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it takes numbers, {range_text(self.param)}.")
+            text = f"{self.name!r} can't be {short_repr(value)}: it takes numbers, {range_text(self.param)}."
+            raise InvalidValue(text)
         if self.integer and value != int(value):
             way_out = f"Give tune() a range of floats for it, as ({self.bottom:.1f}, {self.top:.1f})."
-            raise ValueError(f"{self.name!r} takes whole numbers, not {short_repr(value)}. {way_out}")
+            raise InvalidValue(f"{self.name!r} takes whole numbers, not {short_repr(value)}. {way_out}")
         number = int(value) if self.integer else _item(value)
         if not allows(self.param, number):
             raise refused(self.name, value, self.param)
@@ -94,7 +96,7 @@ class Scale:
         if not least <= number <= greatest:
             kind = type(self.first).__name__
             way_out = f"Set the runner to a number of Python first: runner[{self.name!r}] = {self.first.item()!r}"
-            raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it is of type {kind}. {way_out}")
+            raise InvalidValue(f"{self.name!r} can't be {short_repr(value)}: it is of type {kind}. {way_out}")
         return same_type(self.first)(number)
 
     def grown(self, low: float, high: float, value: Any) -> tuple[float, float]:
@@ -144,9 +146,11 @@ def same_type(value: Any) -> Callable[[Any], Any]:
 
 def refused(name: str, value: Any, param: Any) -> ValueError:
     """Return the error for a value outside of a range."""
-    return ValueError(
-        f"{name!r} can't be {short_repr(value)}: its range is {range_text(param)}. Give tune() a wider hint for it."
-    )
+    way_out = "Give tune() a wider hint for it."
+    if isinstance(param, Param) and param.odd and is_integer(value):
+        near = [str(odd) for odd in (value - 1, value + 1) if allows(param, odd)]
+        way_out = f"Set {' or '.join(near)}." if near else way_out
+    return InvalidValue(f"{name!r} can't be {short_repr(value)}: its range is {range_text(param)}. {way_out}")
 
 
 def exponent(value: Any) -> float:

@@ -13,7 +13,7 @@ from epypes.acquisition.files import is_video_name
 from epypes.acquisition.frames import with_images
 from epypes.acquisition.video import Video
 from epypes.display import encode_image, is_image
-from epypes.errors import PayloadError, UnknownName
+from epypes.errors import InvalidType, InvalidValue, PayloadError, UnknownName
 from epypes.graph import colour_order
 from epypes.images import Order
 from epypes.run import CompGraphRunner
@@ -203,12 +203,12 @@ def is_alike(one: Any, other: Any) -> bool:
 def _listed(images: Any) -> list[Any]:
     if is_array(images) or isinstance(images, str | bytes | os.PathLike | Mapping) or not isinstance(images, Iterable):
         kind = type(images).__name__
-        raise TypeError(f"images is a list of what the graph is to be tuned on, not a single {kind!r}: images=[...].")
+        raise InvalidType(f"images is a list of what the graph is to be tuned on, not a single {kind!r}: images=[...].")
     listed = list(images)
     if not listed:
-        raise ValueError("images is empty. Give at least one, or leave it out to tune on the last payload.")
+        raise InvalidValue("images is empty. Give at least one, or leave it out to tune on the last payload.")
     if any(isinstance(image, Video) for image in listed):
-        raise TypeError("A video in a list of images. Give it alone, images=video, or frames of it: [*video[::25]].")
+        raise InvalidType("A video in a list of images. Give it alone, images=video, or frames of it: [*video[::25]].")
     return listed
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display import Backdrop
 from epypes.display.previews.images import Range, some_of
+from epypes.errors import InvalidValue
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,11 +61,11 @@ class PictureSettings:
             object.__setattr__(self, "limits", _checked_limits(self.limits))
         for name, value, known in (("colour_map", self.colour_map, COLOUR_MAPS), ("zoom", self.zoom, ZOOMS)):
             if value not in known:
-                raise ValueError(f"{name} can't be {value!r:.40}: it is one of {', '.join(known)}.")
+                raise InvalidValue(f"{name} can't be {value!r:.40}: it is one of {', '.join(known)}.")
         if not isinstance(self.over, str):
-            raise ValueError(f"over can't be {self.over!r:.40}: it is the name of a token.")
+            raise InvalidValue(f"over can't be {self.over!r:.40}: it is the name of a token.")
         if type(self.opacity) not in (int, float) or not 0 <= self.opacity <= 1:
-            raise ValueError(f"opacity can't be {self.opacity!r:.40}: it is a number from 0 to 1.")
+            raise InvalidValue(f"opacity can't be {self.opacity!r:.40}: it is a number from 0 to 1.")
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> PictureSettings:
@@ -72,7 +73,7 @@ class PictureSettings:
         known = [field.name for field in fields(cls)]
         unknown = [name for name in content if name not in known]
         if unknown:
-            raise ValueError(f"{unknown[0]!r:.40} is no setting of a picture. Those are {', '.join(known)}.")
+            raise InvalidValue(f"{unknown[0]!r:.40} is no setting of a picture. Those are {', '.join(known)}.")
         return cls(**content)
 
     @property
@@ -93,7 +94,7 @@ def _checked_limits(given: Any) -> Range:
     except (TypeError, ValueError, OverflowError):
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"limits can't be {given!r:.60}: they are two numbers, black and white, the lower one first.")
+        raise InvalidValue(f"limits can't be {given!r:.60}: give two numbers, black and white, the lower first.")
     return low, high
 
 

@@ -17,6 +17,7 @@ export function numberBox(panel, row, index) {
   let position = row.value[index];
   let exact = position;
   let isTyping = false;
+  let isNoticed = false;
 
   const values = () => row.names.map((one) => panel.state.values[one]);
   const current = () => (means(row, index, position, exact) ? exact : position);
@@ -46,8 +47,15 @@ export function numberBox(panel, row, index) {
     show();
   }
 
-  function place(value, commit) {
+  /** Say that the value is not the one that was typed, until the next one is taken. */
+  function tellNotice(notice) {
+    if (notice || isNoticed) panel.tell(notice);
+    isNoticed = Boolean(notice);
+  }
+
+  function place(value, commit, notice = "") {
     restore();
+    tellNotice(notice);
     position = exact = value;
     show();
     panel.change(name, value, commit);
@@ -58,7 +66,7 @@ export function numberBox(panel, row, index) {
     if (!isTyping) return;
     const found = read(row, index, input.value, values());
     if ("problem" in found) complain(found.problem);
-    else place(found.value, true);
+    else place(found.value, true, found.notice);
   }
 
   function onKey(event) {
@@ -95,6 +103,7 @@ export function numberBox(panel, row, index) {
     moved(value) {
       if (same(value, position)) return;
       position = value;
+      tellNotice("");
       if (isRefused()) restore();
       else show();
     },

@@ -60,7 +60,7 @@ export function clamped(row, index, value, values) {
  * @param {number} index of the value in its row
  * @param {string} text
  * @param {(number | undefined)[]} [values] of the whole row: a pair keeps its order
- * @returns {{value: number} | {problem: string}}
+ * @returns {{value: number, notice?: string} | {problem: string}} A notice says that the value is not the typed one.
  */
 export function read(row, index, text, values) {
   const name = row.names[index];
@@ -71,7 +71,8 @@ export function read(row, index, text, values) {
   const { low, high } = ends(row, index, values);
   const asked = row.odd ? asKind(row, value) : value;
   if (asked < low || value > high) return { problem: `${name} can't be ${typed}: ${ranged(row, index, low, high)}.` };
-  return { value: row.odd ? clamped(row, index, value, values) : value };
+  const taken = row.odd ? clamped(row, index, value, values) : value;
+  return taken === value ? { value } : { value: taken, notice: `${name} takes odd numbers: ${typed} became ${taken}.` };
 }
 
 function ranged(row, index, low, high) {
