@@ -67,7 +67,7 @@ def test_every_graph_that_is_saved_in_a_tutorial_is_drawn_when_it_is_opened(
 def test_a_tutorial_ends_with_a_panel_that_can_be_moved(lab_page: Any, name: str, slider: str, key: str) -> None:
     notebook = Notebook(lab_page, f"{name}.ipynb")
     notebook.run_all()
-    panel = lab_page.locator(".jp-Cell").last.locator(".epypes-panel")
+    panel = lab_page.locator(".jp-CodeCell").last.locator(".epypes-panel")
     panel.scroll_into_view_if_needed()
     picture = panel.locator("img.epypes-picture")
     value = "(picture, name) => JSON.parse(picture.dataset.values ?? '{}')[name]"
