@@ -24,8 +24,6 @@ from tests.replays import WarmProcesses
 
 __all__ = ["broker", "certificates", "mosquitto", "nats", "rabbitmq"]
 
-# They inherit it: the tutorial on the experiment asks so often where a reader asks 500 times.
-os.environ.setdefault("EPYPES_REQUESTS", "20")
 # Dask reads it when it is imported: a worker that is started again is a fork of a process that has Dask loaded.
 os.environ.setdefault("DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD", "forkserver")
 # What is started in the background of a shell ignores Ctrl+C, and so would all that tests start and interrupt.

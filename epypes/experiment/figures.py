@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from epypes.display.paint.plot import BLUE, PLOT_STYLE, RED, Plot, plot
 from epypes.experiment.results import PAPER, LogNormal, answered, lognormal_fit
@@ -163,6 +164,7 @@ def _mark(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -
     high = max(most, mode, paper) * _MARGIN
     axes.set(xscale="log", xlim=(low, high))
     axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(LogFormatter())  # 6, not 6 x 10^0
 
 
 def _draw_curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:

@@ -19,8 +19,8 @@ def test_each_cell_says_that_no_broker_is_installed_and_none_fails(tmp_path):
     notebook = nbformat.read(TUTORIAL, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(HIDDEN))
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
-    said = [cell.outputs for cell in notebook.cells if cell.cell_type == "code"][2:]
-    assert len(said) > 10
+    said = [cell.outputs for cell in notebook.cells if cell.cell_type == "code"][1:]
+    assert len(said) >= 10
     for outputs in said:
         text = "".join(output["text"] for output in outputs)
         assert text == "Skipped: no broker is installed here. On Debian and Ubuntu: apt install nats-server\n"

@@ -32,14 +32,15 @@ PLOT_STYLE: Final[list[Any]] = [
 # Okabe and Ito's, which people with any colour vision tell apart; the red is darker, to be seen on white.
 BLUE: Final = "#0072b2"
 RED: Final = "#c44e00"
-# What Matplotlib writes -> what a page has instead, in this order. An image knows no variables, and has what stands on
-# paper; on a page no rule of a plot is one for all pictures; names of fonts have quotes that an address can't hold.
+# What Matplotlib writes -> what a page has instead, in this order. An image knows no variables: it has no ground, and a
+# grey for text that is readable on light and on dark. On a page no rule of a plot is one for all pictures; names of
+# fonts have quotes that an address can't hold.
 _THEMED: Final = {
     r"^.*?(?=<svg )|<metadata>.*?</metadata>|<!--.*?-->|<defs>\s*<style.*?</style>\s*</defs>": "",
     r"(<svg[^>]*?) height=\S+": r"\1",  # follows the width, which is no more than that of the page
     '<g id="figure_1">': '<g id="figure_1" style="fill: #000000; stroke-linejoin: round">',
-    "#000000": "var(--epypes-text,#000000)",
-    "#ffffff": "var(--epypes-paper,#ffffff)",
+    "#000000": "var(--epypes-text,#767676)",
+    "#ffffff": "var(--epypes-paper,none)",
     BLUE: f"var(--epypes-accent,{BLUE})",
     RED: f"var(--epypes-warn,{RED})",
     # Of figures in the style "ggplot", as Optuna's: the ground of the axes, their texts, edges, dots, lines and bars.
