@@ -93,7 +93,7 @@ def test_the_core_imports_without_any_extra(environment):
 
 
 def test_the_first_tutorial_runs_with_what_colab_has_and_one_line(environment):
-    # %pip install 'epypes[widgets]'
+    # As %pip install './epypes-VERSION-py3-none-any.whl[widgets]' does.
     colab = environment("widgets", COLAB)
     kinds, changed = colab.python(EXECUTES, str(TUTORIAL), *COLAB).splitlines()
     assert {"image/svg+xml", "application/vnd.jupyter.widget-view+json"} <= set(kinds.split())
