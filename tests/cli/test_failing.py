@@ -99,6 +99,7 @@ ROWS = {
     "experiment": [(["--camera", "left.png"], "cameras must be two")],
     "demo": [(["{folder}/none.ipynb", "--to", "{folder}/demo"], "Notebook {folder}/none.ipynb can't be read")],
     "lab": [(["{folder}/none"], "There is no folder '{folder}/none' to show in JupyterLab")],
+    "completion": [],  # writes a text; a shell that it does not know is click's error
 }
 
 
