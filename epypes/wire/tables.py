@@ -81,7 +81,9 @@ def write_table(writer: ValueWriter, message: Any, value: Any, path: Path) -> No
         batch = arrow.RecordBatch.from_pandas(frame, nthreads=1)
         objects = _object_columns(arrow, batch.schema)
     except (arrow.ArrowException, *_PANDAS_ERRORS) as error:
-        text = f"that Arrow can't hold: {'; '.join(map(str, error.args)):.200}. Return table.to_dict('list') instead"
+        # Arrow's own errors name the column in a second argument.
+        why = "; ".join(map(str, error.args)) if isinstance(error, arrow.ArrowException) else str(error)
+        text = f"that Arrow can't hold: {why:.200}. Return table.to_dict('list') instead"
         raise _no_codec(path, text) from error
     writer.counter.count(path, batch.num_rows * objects)
     sink = arrow.BufferOutputStream()
@@ -193,8 +195,9 @@ def read_arrow_table(reader: ValueReader, content: Any, path: Path) -> Any:
         stream = arrow.ipc.open_stream(arrow.py_buffer(data))
         objects = _object_columns(arrow, stream.schema)
         table = stream.read_all()
-        # Without columns nothing else bounds the rows.
-        reader.counter.count(path, table.num_rows * (objects or not table.num_columns))
+        # Without columns nothing else bounds the rows, and categories that are null take no bytes.
+        categories = sum(_object_categories(arrow, column) for column in table.columns)
+        reader.counter.count(path, table.num_rows * (objects or not table.num_columns) + categories)
         table.validate(full=True)
         frame = _frame_of(table, content.numbered)
     except MessageError:
@@ -226,6 +229,13 @@ def _object_columns(arrow: Any, schema: Any) -> int:
             raise ValueError(f"column {column.name!r:.80} is of Arrow's type {kind!s:.60}")
         count += is_one_of(kind, _OBJECT_TYPES)
     return count
+
+
+def _object_categories(arrow: Any, column: Any) -> int:
+    """Return how many categories, which are objects in pandas, a column of Arrow has."""
+    if not arrow.types.is_dictionary(column.type):
+        return 0
+    return max((len(chunk.dictionary) for chunk in column.chunks), default=0)
 
 
 def _is_compressed(metadata: bytes) -> bool:

@@ -34,7 +34,7 @@ def folder(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_version_is_the_newest_tag_and_the_fallback_without_one(folder):
+def test_the_version_is_the_newest_tag_of_one_and_the_fallback_without_one(folder):
     assert version_of(folder) == FALLBACK
     git("init", folder=folder)
     git("add", ".", folder=folder)
@@ -47,6 +47,10 @@ def test_the_version_is_the_newest_tag_and_the_fallback_without_one(folder):
     (folder / "changed").write_text("not committed")
     assert version_of(folder) == "9.8.7"
     git("tag", "v9.9.0.dev0", folder=folder)
+    assert version_of(folder) == "9.9.0.dev0"
+    git("commit", "-m", "third", "--allow-empty", folder=folder)
+    for tag in ("data/v1", "paper-2019", "before-2020-cleanup"):
+        git("tag", tag, folder=folder)
     assert version_of(folder) == "9.9.0.dev0"
 
 

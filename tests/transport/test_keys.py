@@ -115,6 +115,16 @@ def test_keys_of_zmq_auth_are_read(tmp_path):
     assert read_keys(secret).public == zmq.auth.load_certificate(public)[0].decode()
 
 
+def test_keys_that_can_not_be_made_whole_leave_nothing_behind(tmp_path):
+    make_keys(tmp_path / "camera")
+    (tmp_path / "camera.key_secret").unlink()
+    with pytest.raises(KeysError, match=r"camera\.key exists"):
+        make_keys(tmp_path / "camera")
+    assert [file.name for file in tmp_path.iterdir()] == ["camera.key"], "no secret key that is of another pair"
+    with pytest.raises(KeysError, match="names no keys"):
+        make_keys("")
+
+
 def test_a_folder_of_key_files_is_a_list(tmp_path):
     robot = make_keys(tmp_path / "robot")
     known = [make_keys(tmp_path / "known" / name) for name in ("one", "two")]

@@ -118,7 +118,12 @@ def test_odd_functions_have_tips_too() -> None:
         def __call__(self, image: Any, x: int) -> Any:
             return image
 
+    def odd(image: Any, x: int) -> Any:
+        return image
+
     assert said(Callable()) == ""
+    odd.__doc__ = ": :\n:type x"  # the parser of docstrings raises IndexError
+    assert said(odd) == ""
     assert said(cv2.Canny, "p", None, q=1, edges=2, sizes=3).startswith("First threshold")
     cg = ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")})
     assert tooltip(cg, "x", ranges(ep.CompGraphRunner(cg, {"x": 70}), {})["x"]) == "Usually 0 to 210."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import sys
 
 import numpy as np
@@ -155,14 +156,14 @@ def test_tables_within_the_labels_of_tables_are_refused_beyond_the_depth():
 # -- what is not trusted ----------------------------------------------------------------------------------------------
 
 
-def received(table, *, compression=None, series=False, limits=None):
+def received(table, *, compression=None, series=False, limits=None, change=bytes):
     """Return what is read of a message with a table of Arrow."""
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as stream:
         stream.write_table(table)
     message = message_class("epypes.v1.Envelope")()
     content = message.parts.add(name="v").value.arrow_table
-    content.inline, content.series = sink.getvalue().to_pybytes(), series
+    content.inline, content.series = change(sink.getvalue().to_pybytes()), series
     if series:
         content.name.none = True
     return decode([b"/", message.SerializeToString()], limits or Limits()).parts["v"]
@@ -206,6 +207,20 @@ def test_values_that_are_objects_are_counted(table):
     with pytest.raises(MessageError) as caught:
         received(table, limits=Limits(values=500))
     assert caught.value.reason == "too many values"
+
+
+@pytest.mark.parametrize("count", [2**20 + 1, 2**60])
+def test_categories_without_bytes_are_counted(count):
+    table = pa.table({"x": pa.DictionaryArray.from_arrays(pa.array([0], pa.int8()), pa.nulls(1_234_567))})
+    with pytest.raises(MessageError) as caught:
+        received(table, change=lambda data: data.replace(struct.pack("<q", 1_234_567), struct.pack("<q", count)))
+    assert caught.value.reason == "too many values"
+
+
+def test_a_text_that_is_not_unicode_is_named_in_an_error_that_can_be_printed():
+    with pytest.raises(MessageError, match=r"can't encode character '\\ud800'") as caught:
+        encode(Envelope("", {"v": pd.DataFrame({"what": pd.Series(["\ud800"], dtype=object)})}))
+    assert str(caught.value).encode()
 
 
 def test_where_pandas_or_pyarrow_is_missing_the_error_says_so(monkeypatch):

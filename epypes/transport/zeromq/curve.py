@@ -6,6 +6,7 @@ A pair of keys is two certificates of ``zmq.auth``: ``NAME.key`` with the public
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import re
@@ -72,13 +73,15 @@ def make_keys(path: str | Path) -> Keys:
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
         # zmq.auth replaces files, and lets others read the secret key: so it writes into a folder of this user alone.
-        with tempfile.TemporaryDirectory(dir=stem.parent) as private:
+        with tempfile.TemporaryDirectory(dir=stem.parent) as private, contextlib.ExitStack() as undo:
             public, secret = map(Path, create_certificates(private, stem.name))
             secret.chmod(0o600)
             for file in (secret, public):
                 place = stem.with_name(file.name)
                 place.touch(exist_ok=False)
+                undo.callback(place.unlink)
                 file.replace(place)
+            undo.pop_all()
     except FileExistsError as error:
         raise KeysError(error.filename, f"{error.filename} exists. Take another name, or move it away.") from error
     except OSError as error:
@@ -247,6 +250,8 @@ class CurveOptions:
 
 
 def _stem(path: Path) -> Path:
+    if not path.name:
+        raise KeysError(path, f"{path} names no keys. Give a name: {path / 'camera'}")
     return path.with_suffix("") if path.suffix in {".key", ".key_secret"} else path
 
 
@@ -260,7 +265,7 @@ def _read(path: Path) -> Keys:
     except OSError as error:
         text = f"No key can be read from {path}: {error.strerror or 'there is no such file'}."
         raise KeysError(path, f"{text} epypes.transport.make_keys makes one.") from error
-    except ValueError:
+    except (ValueError, IndexError):  # the latter for a line that has no value
         keys = [""]
     if not _KEY.fullmatch(keys[0]) or not all(_KEY.fullmatch(key) for key in keys if key):
         raise KeysError(path, f"{path} is no key file. epypes.transport.make_keys makes one.")

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from typing import Any, Final
 
-from docstring_parser import Docstring, ParseError, parse
+from docstring_parser import Docstring, parse
 
 from epypes.graph import CompGraph, unwrapped
 from epypes.hints import Param
@@ -54,7 +54,7 @@ def _parsed(text: str) -> Docstring:
     """Return a docstring of any style: NumPy's, Google's, Sphinx' or Epydoc's."""
     try:
         return parse(text)
-    except ParseError:
+    except Exception:  # for some texts the parser raises others than its ParseError
         return Docstring()
 
 
