@@ -58,6 +58,7 @@ class Options:
         Whether the broker delivers all events of one source to one replica, so that replicas may have state.
     tracer_provider
         Of OpenTelemetry: each event is a span of it; None for that which is set for this process, if there is one.
+        Give it a BatchSpanProcessor: a SimpleSpanProcessor has the service wait for its exporter, span by span.
     """
 
     sub: str = ANY_PORT

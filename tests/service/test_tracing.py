@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import threading
 from time import time_ns
 
 import pytest
-from opentelemetry.sdk.trace import TracerProvider
-from opentelemetry.sdk.trace.export import SimpleSpanProcessor
+from opentelemetry.sdk.trace import SpanProcessor, TracerProvider
+from opentelemetry.sdk.trace.export import BatchSpanProcessor, SimpleSpanProcessor, SpanExporter, SpanExportResult
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.trace import SpanKind, StatusCode
 
@@ -102,3 +103,35 @@ def test_each_event_is_a_span_with_its_functions_and_its_failure(bundle):
 
     assert third.status.status_code is StatusCode.ERROR
     assert children(third) == []
+
+
+class RaisingProcessor(SpanProcessor):
+    def on_start(self, span, parent_context=None):
+        raise ValueError("no span")
+
+
+class BlockingExporter(SpanExporter):
+    def __init__(self):
+        self.entered, self.released = threading.Event(), threading.Event()
+
+    def export(self, spans):
+        self.entered.set()
+        self.released.wait()
+        return SpanExportResult.SUCCESS
+
+
+def test_a_processor_that_raises_and_an_exporter_that_blocks_hold_no_event_up(bundle):
+    exporter = BlockingExporter()
+    blocked, raising = TracerProvider(shutdown_on_exit=False), TracerProvider()
+    blocked.add_span_processor(BatchSpanProcessor(exporter, max_queue_size=4, max_export_batch_size=2))
+    raising.add_span_processor(RaisingProcessor())
+    try:
+        for provider in (raising, blocked):
+            with serving(bundle, tracer_provider=provider) as (_, peer):
+                for number in range(8):
+                    peer.requests.put(Envelope("x", {"number": number}))
+                    assert peer.take()[0].parts["out"] == 2 * number
+        assert exporter.entered.is_set()
+    finally:
+        exporter.released.set()
+        blocked.shutdown()
