@@ -17,8 +17,8 @@ from epypes.wire.protobuf import message_class
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-# Those of ours that Foxglove shows; they have the same names there.
-_RAW_ENCODINGS: Final = frozenset({"mono8", "mono16", "bgr8", "rgb8", "bgra8", "rgba8"})
+# Those of ours that Foxglove shows, with the bytes of a pixel; they have the same names there.
+_RAW_ENCODINGS: Final = {"mono8": 1, "mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}
 _FILE_STARTS: Final = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
 _SECOND_NS: Final = 10**9
 
@@ -94,7 +94,8 @@ def image_data(schema: str, message: bytes) -> bytes:
 
 
 def _raw_image(content: Any, data: memoryview) -> Any:
-    if content.encoding not in _RAW_ENCODINGS or content.height * content.step != data.nbytes:
+    row = content.width * _RAW_ENCODINGS.get(content.encoding, 0)
+    if not 0 < row <= content.step or content.height * content.step != data.nbytes:
         return None
     fields = {name: getattr(content, name) for name in ("width", "height", "encoding", "step")}
     return message_class("foxglove.RawImage")(**fields)

@@ -219,6 +219,15 @@ def test_a_frame_that_many_parts_name_is_one_image():
     assert len([*foxglove_images([frames[0], message.SerializeToString(), frames[2]], 1)]) == 1
 
 
+@pytest.mark.parametrize("lie", [{"width": 2**31}, {"width": 0}, {"height": 1}, {"step": 0}, {"encoding": "bgra8"}])
+def test_an_image_that_declares_another_size_than_it_has_is_not_shown(lie):
+    frames = encode(Envelope("a", {"left": IMAGE}))
+    message = message_class("epypes.v1.Envelope").FromString(frames[1])
+    for name, value in lie.items():
+        setattr(message.parts[0].value.image, name, value)
+    assert not [*foxglove_images([frames[0], message.SerializeToString(), frames[2]], 1)]
+
+
 def copy_without_images(path, file) -> None:
     """Write what a filter of topics leaves of a recording."""
     from mcap.reader import make_reader
