@@ -79,7 +79,7 @@ $(VENV)/.test: pyproject.toml | $(BIN)/python
 	touch $@ $(VENV)/.all
 
 $(VENV)/.bench: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[all]' --group test --group bench
+	$(PIP) --editable '.[all]' --group test --group docs --group bench
 	$(PIP) --target $(VENV)/published --no-deps epypes==0.1.1
 	touch $@ $(VENV)/.test $(VENV)/.all
 

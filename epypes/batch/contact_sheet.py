@@ -250,7 +250,7 @@ def _require_shown(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> st
         return token
     pictured = dict.fromkeys(name for outcome in outcomes for name in outcome.thumbnails)
     there_are = f"There are pictures of {', '.join(pictured)}." if pictured else "There are none of any token."
-    raise ScaleError(f"No pictures of {token!r} were kept. {there_are} Sweep again with show=({token!r},).")
+    raise ScaleError(f"No pictures of {token!r} were kept. {there_are} Run it again with show=({token!r},).")
 
 
 # -- the page ---------------------------------------------------------------------------------------------------

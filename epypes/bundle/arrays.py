@@ -79,8 +79,8 @@ class ArrayFiles:
 
 
 def is_storable(value: Any) -> bool:
-    """Whether a value is an array of numbers, which a file holds to the last bit."""
-    return is_plain_array(value) and value.dtype.kind in "biufc"
+    """Whether a value is an array without objects, which a file holds to the last bit."""
+    return is_plain_array(value) and not value.dtype.hasobject
 
 
 def store_hyperparameters(values: Mapping[str, Any], most_numbers: int) -> tuple[dict[str, Any], ArrayFiles]:

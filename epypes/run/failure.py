@@ -27,6 +27,8 @@ _MOST_ITEMS: Final = 1_000
 _OF_NONE: Final = re.compile(r"None|\bempty\b|OpenCV\(")
 # What OpenCV and Python say that have got a path for an image.
 _OF_TEXT: Final = re.compile(r"not a numpy array|(str|Path)' object has no attribute")
+# What OpenCV says of the number of channels that an image has.
+_OF_CHANNELS: Final = re.compile(r"number of channels.*'scn' is (\d+)", re.DOTALL)
 _WAS_IT_FOUND: Final = "Was the file found? cv2.imread returns None for a file that it can't read."
 _DOES_IT_RETURN: Final = (
     "Does it return a value? One that has found nothing can return ep.Nothing: what takes that is skipped."
@@ -142,6 +144,12 @@ def _causes(tokens: TokenManager, place: int, exception: BaseException, frozen: 
         elif isinstance(value, str | os.PathLike) and token not in frozen and _OF_TEXT.search(str(exception)):
             kind = "text" if isinstance(value, str) else "path"
             yield f"{token} is a {kind}, not an image. Read the file first: cv2.imread({str(value)!r:.{_BRIEF}})."
+        elif is_array(value) and (found := _OF_CHANNELS.search(str(exception))):
+            count = value.shape[2] if value.ndim == 3 else 1
+            if value.ndim in (2, 3) and count == int(found[1]):
+                yield f"{token} has {count} channel{'s' * (count > 1)}, which this conversion of colours does not take."
+                if count == 1:
+                    yield "It is grey: leave a conversion to grey out, or pass an image with 3 channels."
         elif value is not None and (type(value) in _NUMBERS or is_numpy_scalar(type(value))):
             reason = reason_against(program.cg, step.name, token, value)
             if reason:

@@ -86,7 +86,9 @@ def test_zeros_of_either_sign_are_two_values_since_both_are_run(runner: ep.CompG
 def test_any_token_that_has_pictures_can_be_shown(runner: ep.CompGraphRunner) -> None:
     result = ep.sweep(runner, {"offset": [1, 2]}, show=["image"])
     assert result.sheet().token == "image"
-    with pytest.raises(ScaleError, match=r"No pictures of 'bright'.*There are pictures of image.*show=\('bright',\)"):
+    with pytest.raises(
+        ScaleError, match=r"No pictures of 'bright'.*There are pictures of image.*Run it again with show=\('bright',\)"
+    ):
         result.sheet("bright")
     with pytest.raises(UnknownName, match="Did you mean 'bright'"):
         result.sheet("brigt")

@@ -32,9 +32,9 @@ SHOW = """
 panel = tune(runner)
 panel
 """
-RESTARTED = "The kernel was restarted: run this cell again."
-KEPT = "Kept from the last run: run this cell again to go on."
-ENDED = "The kernel of this panel has ended: run this cell again."
+RESTARTED = "The kernel was restarted: run the cells again, up to this one."
+KEPT = "Kept from the last run: run the cells up to this one to go on."
+ENDED = "The kernel of this panel has ended: run the cells again, up to this one."
 CONTEXT = "jupyterapp.shell.currentWidget.sessionContext"
 # What ipywidgets draws on a part whose kernel is gone.
 BROKEN = """() => [...document.querySelectorAll('.jupyter-widgets-disconnected')]
@@ -89,8 +89,10 @@ def test_a_kernel_that_dies_is_a_restart_and_one_that_is_shut_down_has_ended(not
     notebook.run_all()
     panel = PanelOnScreen(notebook)
     panel.wait_for_status("")
+    panel.choose("image")
     notebook.page.evaluate(f"() => {CONTEXT}.shutdown()")
     check_ended(panel, ENDED)
+    assert panel.page.locator(".epypes-chip[aria-selected=true]").get_attribute("data-token") == "image"
 
 
 def test_a_notebook_that_is_opened_again_shows_the_picture_and_the_line_and_no_error(

@@ -178,6 +178,52 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
         "def constants(a):\n    return LOW + STEPS + len(NAMES), END, len(WORD.findall('a b')), float(HALF), list(SPAN), KERNEL @ a[ROW, :1].repeat(2, 0)",
         {"constants": "constants"},
     ),
+    "function with others for other types": (
+        "@functools.singledispatch\ndef kind(v):\n    return 'any'\n@kind.register\ndef _(v: np.ndarray):\n    return f'array {kind(v.ndim)}'\n"
+        "@kind.register(int)\ndef _(v):\n    return f'int {v}'\nkind.register(list, len)\ndef kinds(a):\n    return kind(a), kind(None), kind([1, 2])",
+        {"kind": "kind", "kinds": "kinds"},
+    ),
+    "class that registers those that are derived from it": (
+        "class Measure:\n    known = {}\n    def __init_subclass__(cls, name, **more):\n        super().__init_subclass__(**more)\n"
+        "        Measure.known[name] = cls\nclass Mean(Measure, name='mean'):\n    def of(self, a):\n        return float(a.mean())\n"
+        "class Top(Measure, name='top'):\n    def of(self, a):\n        return float(a.max())\n"
+        "def measured(a):\n    return Measure.known['top' if a[0, 0] else 'mean']().of(a)",
+        {"measured": "measured"},
+    ),
+    "object of a class, and its methods": (
+        "class Filter:\n    def __init__(self, size, *, gain=1.0):\n        self.kernel, self.gain = np.ones(size) / size, gain\n"
+        "    def smooth(self, a):\n        return np.convolve(a[0], self.kernel) * self.gain\n    def __call__(self, a):\n        return self.smooth(a) + 1\n"
+        "SIZE = 3\nfilter_3 = Filter(SIZE, gain=2.0)\ndef filtered(a):\n    return filter_3.smooth(a)",
+        {"filtered": "filtered", "method_of_own": "filter_3.smooth", "called": "filter_3"},
+    ),
+    "object with a cached property": (
+        "import dataclasses\n@dataclasses.dataclass\nclass Lens:\n    f: float = 50.0\n    @functools.cached_property\n"
+        "    def matrix(self):\n        return np.diag([self.f, self.f, 1.0])\nLENS = Lens(60.0)\ndef projected(a):\n    return LENS.matrix[:2, :2] @ a",
+        {"projected": "projected"},
+    ),
+    "objects of SciPy": (
+        "from scipy import signal\nfrom scipy.interpolate import CubicSpline\nfrom scipy.spatial import KDTree\n"
+        "POINTS = np.random.default_rng(0).random((20, 2))\nTREE, SOS = KDTree(POINTS), signal.butter(4, 0.2, output='sos')\n"
+        "CURVE = CubicSpline([0, 5, 20], [0.0, 1, 9])\nNEAR = KDTree(POINTS, leafsize=4)\ndef curved(a):\n    return CURVE(a), int(NEAR.query(a[:, 0])[1])\n"
+        "def low_passed(a):\n    return signal.sosfilt(SOS, a)",
+        {"curved": "curved", "low_passed": "low_passed"},
+    ),
+    "values of libraries": (
+        "import types\nimport datetime as dt\nimport matplotlib.colors\nfrom pathlib import PurePosixPath, PureWindowsPath\n"
+        "POSIX, WINDOWS = PurePosixPath('/a/b'), PureWindowsPath('c/d')\nLEVELS = types.MappingProxyType({'low': [1, 2]})\n"
+        "T64, H64, NOT = np.datetime64('2024-02-29T12:30', 'ms'), np.timedelta64(3, 'h'), np.datetime64('NaT')\nUNIT, RAW = np.str_('mm'), np.bytes_(b'cd')\n"
+        "DAY, NOON, ZONE = dt.date(2024, 2, 29), dt.time(12), dt.timezone(dt.timedelta(hours=1), 'A')\nSTART = dt.datetime(2024, 3, 31, 1, 30, tzinfo=ZONE)\n"
+        "CFG = types.SimpleNamespace(low=30, names=['a'])\nGAINS = np.array([(1, 1.5), (2, 2.5)], [('level', 'i4'), ('gain', 'f8')])\nMARKS = np.array(['ok', 'dent'])\n"
+        "DAYS = np.array(['2024-01-01', '2024-02-01'], 'M8[D]')\ndef of_libraries(a):\n    n = int(a.max())\n"
+        "    times = str(T64 + H64 * n), T64.dtype.str, str(NOT), str(DAY), str(NOON), (START + dt.timedelta(days=n)).isoformat(), START.tzname(), str(DAYS[n % 2])\n"
+        "    return times, str(POSIX / f'{n}'), str(WINDOWS), LEVELS['low'][0] + n, UNIT * 2, RAW, CFG.low + len(CFG.names), float(GAINS['gain'] @ [n, 1]), MARKS.tolist()\n"
+        "def coloured(a):\n    return matplotlib.colors.to_rgb(f'C{int(a.max()) % 10}')",
+        {"of_libraries": "of_libraries", "coloured": "coloured"},
+    ),
+    "mock that is undone": (
+        "from unittest import mock\ndef mocked(a):\n    with mock.patch.object(np, 'median', np.max):\n        high = np.median(a)\n    return float(high - np.median(a))",
+        {"mocked": "mocked"},
+    ),
     "function that makes a generator": (
         "def rows(a):\n    yield from a\ndef listed(a):\n    return list(rows(a))", {"listed": "listed"},
     ),
@@ -246,10 +292,6 @@ REFUSED: dict[str, tuple[str, str, str]] = {
         "N = 2\ndef d(g):\n    @functools.wraps(g)\n    def w(a, n=N):\n        return g(a) * n\n    return w\n@d\ndef f(a):\n    return a\nN = 3", "f",
         r"'f' \(cell \[1\], line 7\): its default of 'n' is 2 in the notebook and 3",
     ),
-    "function with others for other types": (
-        "@functools.singledispatch\ndef f(a):\n    return a\n@f.register(float)\ndef _(a):\n    return 1", "f",
-        r"'f' \(cell \[1\], line 1\): its attribute 'registry' keys has \[1\] only in the notebook",
-    ),
     "library's decorator with a changed argument": (
         "N = 2\n@functools.lru_cache(N)\ndef f(a):\n    return a\nN = 3", "f", r"'f' \(cell \[1\], line 2\): its parameters\['maxsize'\] is 2 in the notebook and 3",
     ),
@@ -273,6 +315,26 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "attribute of a module that is set by name": (
         "def f(a):\n    setattr(np, '_counted_here', getattr(np, '_counted_here', 0) + 1)\n    return a * np._counted_here", "f",
         r"writes into 'np', .*\(cell \[1\], line 2\)",
+    ),
+    "environment that a cell changes": (
+        "import os\nos.environ['EPYPES_HOSTILE'] = '2'\ndef f(a):\n    return os.getenv('EPYPES_' + 'HOSTILE')", "f",
+        r"'f' reads the environment, which the notebook has changed \(cell \[1\], line 2\).* make the value a token",
+    ),
+    "environment by a name of its own": (
+        "from os import environ, path\nenviron.setdefault('EPYPES_HOSTILE', '2')\ndef f(a):\n    return path.expandvars('$EPYPES_HOSTILE')", "f",
+        r"reads the environment, which the notebook has changed \(cell \[1\], line 2\)",
+    ),
+    "colour map that a cell registers": (
+        "import matplotlib\nmatplotlib.colormaps.register(matplotlib.colormaps['gray'], name='epypes_hostile', force=True)\n"
+        "def f(a):\n    return matplotlib.colormaps['epypes_hostile'](a)", "f", r"'matplotlib\.colormaps', which the notebook has changed \(cell \[1\], line 2\)",
+    ),
+    "object that keeps something": (
+        "class Mean:\n    def __init__(self):\n        self.seen = []\n    def add(self, a):\n        self.seen.append(a)\n        return len(self.seen)\n"
+        "mean = Mean()\ndef f(a):\n    return mean.add(a)", "f", r"uses 'mean' from it, of type Mean.* cg = ep\.delay\(cg, 'mean', 'mean_before'",
+    ),
+    "object that was changed": (
+        "class Level:\n    def __init__(self, k):\n        self.k = k\n    def of(self, a):\n        return a > self.k\nlevel = Level(3)\nlevel.k = 5\nf = level.of", "f",
+        r"attribute 'k' is 5 in the notebook and 3 in the module",
     ),
     "changed module that a function imports": (
         "import string\nsetattr(string, 'digits', '0123456789')\ndef f(a):\n    from string import digits\n    return digits", "f",

@@ -14,6 +14,7 @@ from epypes.bundle import verify
 from epypes.bundle.proof.compare import SAFETY, Tolerance, difference, differences, first_difference, read_tolerances
 from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError, PromotionRefused
+from tests.bundle.hostile import in_notebook
 from tests.bundle.test_slicer import notebook
 
 SOURCE = """
@@ -60,6 +61,16 @@ def promoted(cg, to, hparams=None, outputs=None):
     return bundle
 
 
+def test_a_draw_without_a_seed_on_a_branch_that_no_sample_takes_is_noted(tmp_path):
+    source = "import random\ndef sample(x):\n    return random.choice([1, 2]) if x.mean() > 1 else 0\n"
+    runner, notes = ep.CompGraphRunner(ep.CompGraph.from_functions(notebook(source)["sample"])), []
+    runner.run(x=X)
+    ep.promote(runner, tmp_path / "bundle", on_progress=notes.append)
+    assert any(
+        "'sample' draws by 'choice' from the random generator of random, which nothing seeds" in n for n in notes
+    )
+
+
 def test_what_computes_the_same_has_no_tolerance(tmp_path):
     assert promoted(graph("exact"), tmp_path).settings.tolerances == {}
 
@@ -94,6 +105,39 @@ def test_what_is_no_noise_is_refused_with_the_first_function_that_differs(names,
     with pytest.raises(PromotionRefused, match=words):
         promoted(ep.CompGraph({name: functions[name] for name in names}, io), tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+# By name: what a cell does, and what the reason says of the function that draws on a branch that no sample takes.
+SEEDED_ELSEWHERE = {
+    "cell": ("np.random.seed(3)", r"'draw' draws by 'normal' from .* of numpy\.random, which the notebook seeds \(.*line 2\)"),
+    "another function": ("", r"'draw' draws by 'normal' .*, which function 'scaled' seeds; .* Seed it in 'draw', or"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SEEDED_ELSEWHERE)
+def test_a_draw_after_a_seed_of_a_cell_or_another_function_is_refused(case, monkeypatch, tmp_path):
+    cell, words = SEEDED_ELSEWHERE[case]
+    seed = "    np.random.seed(3)\n" * (not cell)
+    source = (
+        f"import numpy as np\n{cell}\ndef scaled(x):\n{seed}    return x * 2\n"
+        "def draw(scaled):\n    return np.random.normal() if scaled.mean() > 100 else np.random.default_rng(1).random()"
+    )
+    names = in_notebook(monkeypatch, source)
+    with pytest.raises(PromotionRefused, match=words):
+        promoted(ep.CompGraph.from_functions(names["scaled"], names["draw"]), tmp_path)
+
+
+def test_a_service_has_not_the_environment_that_a_cell_has_set(monkeypatch, tmp_path):
+    cell = (
+        "import os, subprocess\nos.environ['EPYPES_CELL'] = '1'\ndef said(x):\n"
+        "    return subprocess.run(['printenv', 'EPYPES_CELL'], capture_output=True).stdout"
+    )
+    monkeypatch.setenv("EPYPES_CELL", "0")  # is put back in the end
+    names = in_notebook(monkeypatch, cell)
+    with pytest.raises(
+        PromotionRefused, match=r"changed the environment \(cell \[1\], line 2\); a service has its own"
+    ):
+        promoted(ep.CompGraph.from_functions(names["said"]), tmp_path)
 
 
 def test_an_input_that_was_written_into_after_the_run_is_not_blamed_on_random_numbers(tmp_path):

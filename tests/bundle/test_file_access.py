@@ -19,12 +19,12 @@ pytestmark = pytest.mark.slow  # each proves a bundle in a process of its own
 IMAGE = np.arange(3600, dtype=np.uint8).reshape(60, 60)
 
 
-def promoted(source, to, hparams=None, tokens=("image",)):
+def promoted(source, to, hparams=None, tokens=("image",), **more):
     """Run a cell that defines ``use``, and promote the graph of it."""
     cg = ep.CompGraph({"use": cell(source)["use"]}, {"use": (tokens, "out")})
     runner = ep.CompGraphRunner(cg, hparams or {})
     runner.run(image=IMAGE)
-    return ep.promote(runner, to)
+    return ep.promote(runner, to, **more)
 
 
 def reasons_against(source, to, **others):
@@ -79,6 +79,14 @@ def test_a_relative_path_is_refused_since_the_current_folder_is_another_one_ther
     )
     found = r"use\(\) \(pipeline.py, line \d+\) names 'template.png', a file in the current folder here"
     assert re.search(rf"{found}\. The current folder is another one there", reasons)
+
+
+def test_a_relative_path_that_no_sample_opens_is_noted(template, tmp_path, monkeypatch):
+    monkeypatch.chdir(template.parent)
+    notes = []
+    source = "def use(image):\n    return len(open('template.png').read()) if image.size > 9000 else image.size\n"
+    promoted(source, tmp_path / "bundle", on_progress=notes.append)
+    assert re.search(r"use\(\) \(pipeline.py, line \d+\) names 'template.png', a file in the current folder", notes[-1])
 
 
 KEEPERS = {

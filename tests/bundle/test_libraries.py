@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import calendar
 import contextlib
+import csv
 import decimal
 import warnings
 
@@ -11,6 +13,7 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import special
 
 import epypes as ep
 from epypes.bundle.proof.compare import first_difference
@@ -163,6 +166,12 @@ SETTINGS = {
         "import matplotlib.style\nmatplotlib.style.use({'image.cmap': 'gray'})",
         "str(matplotlib.rcParams['image.cmap'])",
     ),
+    "scipy.special.seterr": ("from scipy import special\nspecial.seterr(all='raise')", "special.gamma(-1.0)"),
+    "calendar.setfirstweekday": ("import calendar\ncalendar.setfirstweekday(6)", "calendar.monthcalendar(2024, 5)[0]"),
+    "csv.register_dialect": (
+        "import csv\ncsv.register_dialect('plc', delimiter=';')",
+        "csv.get_dialect('plc').delimiter",
+    ),
     "warnings.simplefilter": ("import warnings\nwarnings.simplefilter('error', RuntimeWarning)", "caught(x)"),
 }
 
@@ -171,16 +180,20 @@ SETTINGS = {
 def settings_put_back():
     with warnings.catch_warnings(), mpl.rc_context(), decimal.localcontext():
         warnings.resetwarnings()
+        errors = special.geterr()
         try:
             yield
         finally:
             pd.reset_option("compute.use_bottleneck")
+            special.seterr(**errors)
+            calendar.setfirstweekday(0)
+            csv.unregister_dialect("plc")
 
 
 @pytest.fixture(scope="module")
 def reasons_against_settings(tmp_path_factory):
     before = (
-        "import decimal, matplotlib\nimport pandas as pd\n"
+        "import calendar, csv, decimal, matplotlib\nimport pandas as pd\nfrom scipy import special\n"
         "def caught(x):\n    try:\n        return float(np.float64(1) / x.min())\n    except RuntimeWarning:\n        return -1.0"
     )
     used = ", ".join(used for _, used in SETTINGS.values())

@@ -130,6 +130,16 @@ def test_modules_beside_the_notebook_come_along_with_what_they_import(project):
 
 
 @SLOW
+def test_a_module_that_registers_something_with_another_one_is_imported_too(project):
+    project.write(
+        table="KNOWN = {}\ndef register(f):\n    KNOWN[f.__name__] = f\n    return f\n",
+        more="import table\n@table.register\ndef doubled(x):\n    return 2 * x\n",
+    )
+    path = project.promote("import table, more\ndef f(x):\n    return table.KNOWN['doubled'](x)", f="f")
+    assert "\nimport more\n" in (path / "pipeline.py").read_text()
+
+
+@SLOW
 @pytest.mark.usefixtures("fresh_interpreter")  # with another hash seed
 def test_functions_of_the_notebook_use_own_modules_by_attribute_constant_class_and_decorator(project):
     project.write(

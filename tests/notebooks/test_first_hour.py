@@ -43,6 +43,7 @@ MISTAKES = {
     "runner.run(imgae=image)": "No token 'imgae' in this graph. Did you mean 'image'?",
     "runner.run(image=cv2.imread('absent.png'))": "image is None. Was the file found?",
     "runner.run(image='photo.png')": ("image is a text, not an image. Read the file first: cv2.imread('photo.png')."),
+    "runner.run(image=image[..., 0])": "image has 1 channel, which this conversion of colours does not take. It is grey",
     "run = runner.run(image=image); run['edgs']": "No token 'edgs' in this graph. Did you mean 'edges'?",
     "runner.rerun(cany_lo=3)": "No token 'cany_lo' in this graph. Did you mean 'canny_lo'?",
     "runner.rerun(blur_kernel=4)": "blur_kernel=4: cv2.GaussianBlur takes an odd number, 1 or more.",

@@ -97,9 +97,28 @@ def test_a_value_that_an_annotation_forbids_is_named_in_its_words():
     assert failure.cause == "k=4: its annotation allows an odd number from 1 to 31."
 
 
+def test_a_grey_image_for_a_conversion_of_colours_is_named_and_the_image_beside_it_is_not():
+    def work(image, other):
+        return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+    grey, coloured = np.zeros((9, 9), np.uint8), np.zeros((9, 9, 3), np.uint8)
+    failure, raised = failure_of(one(work, ("image", "other")), image=grey, other=coloured)
+    assert failure.cause == (
+        "image has 1 channel, which this conversion of colours does not take. "
+        "It is grey: leave a conversion to grey out, or pass an image with 3 channels."
+    )
+    assert raised.__notes__[-1].endswith(failure.cause)
+
+
+def test_an_image_with_too_many_channels_for_a_conversion_is_named():
+    to_colours = one(lambda image: cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    failure, _ = failure_of(to_colours, image=np.zeros((9, 9, 3), np.uint8))
+    assert failure.cause == "image has 3 channels, which this conversion of colours does not take."
+
+
 def test_what_is_only_unusual_is_no_cause(edge_runner, photograph):
     edge_runner["canny_lo"] = 9_000
-    failure, _ = failure_of(edge_runner, image=photograph[..., 0])
+    failure, _ = failure_of(edge_runner, image=photograph.astype(np.float64))
     assert failure.function == "grayscale"
     assert failure.cause == ""
 

@@ -14,7 +14,7 @@ import os
 import re
 import subprocess
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -30,7 +30,7 @@ from epypes.bundle.proof.process_settings import WARNINGS, is_of_texts, library_
 from epypes.bundle.proof.replay import ReplayReport
 from epypes.bundle.proof.replay_process import REPLAY_TIMEOUT_S, replay_isolated, without_python
 from epypes.bundle.settings import read_settings
-from epypes.bundle.source.side_effects import places_of_change
+from epypes.bundle.source.side_effects import environment_changed, places_of_change, seeds_in_notebook
 from epypes.errors import BundleError, PromotionRefused
 from epypes.optional import optional_import
 from epypes.wire.samples import read_sample, save_sample
@@ -178,22 +178,29 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         settings = _changed_settings(usual, draft, places, calls)
         notes = [reason for name, reason in settings.items() if is_of_texts(name)]
         reasons = [reason for name, reason in settings.items() if not is_of_texts(name)]
-        reasons += _changed_libraries(usual, other, draft, places)
+        unseeded = [*_unseeded(usual)]
+        reasons += [
+            *_changed_libraries(usual, other, draft, places),
+            *(text for text, is_refused in unseeded if is_refused),
+        ]
+        notes += [text for text, is_refused in unseeded if not is_refused]
         if refused or usual.outside or not usual.tokens:
             own = _own_reasons(draft, usual, refused)
             reasons += own or _reasons(found, refused, usual, conditions, replays) or [str(usual)]
+            place = environment_changed()
+            reasons += [f"The notebook has changed the environment ({place}); a service has its own."] if place else []
         if reasons:
             raise PromotionRefused(target, [*reasons, *notes])
     if found:
         _tolerate(draft, [entry for entry in found if entry.token != ANSWER])
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
     write_manifest(draft, usual.environment)
-    return replace(usual, notes=[*usual.notes, *notes])
+    return replace(usual, notes=[*usual.notes, *notes, *named_here(draft)])
 
 
 def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, changed: Sequence[Condition]) -> ReplayReport:
     """Replay under usual conditions but for those that are changed; a failure is a difference of no token."""
-    variables: dict[str, str | None] = {**without_python(), "PYTHONHASHSEED": "0"}
+    variables: dict[str, str | None] = {**_environment_of_service(), "PYTHONHASHSEED": "0"}
     for condition in changed:
         variables |= condition.environment
     environment = {name: value for name, value in variables.items() if value is not None}
@@ -203,6 +210,15 @@ def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, change
         return replay_isolated(draft, with_libraries=True, timeout_s=timeout_s, environment=environment, cwd=cwd)
     except BundleError as error:
         return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
+
+
+def _environment_of_service() -> dict[str, str]:
+    """Return the environment without Python's variables; where cells have changed it, as this process has begun."""
+    variables, began = without_python(), Path("/proc/self/environ")
+    if environment_changed() and began.is_file():
+        pairs = (entry.partition("=") for entry in os.fsdecode(began.read_bytes()).split("\0") if entry)
+        variables = {name: value for name, _, value in pairs if not name.startswith("PYTHON")}
+    return variables
 
 
 def _changed_settings(
@@ -248,6 +264,24 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path, p
             "Undo that; call yours by a name of its own, or make the value a token."
         )
     return found[:_MOST_NAMED]
+
+
+def _unseeded(usual: ReplayReport) -> Iterator[tuple[str, bool]]:
+    """Give which functions draw random numbers without a seed, as sentences, each with whether that is refused.
+
+    It is where a cell or another function seeds the generator: in a service, that doesn't decide what is drawn.
+    """
+    cells = {home: f"the notebook seeds ({place})" for home, place in seeds_in_notebook().items()}
+    for name, draws in usual.draws.items():
+        functions = {home: f"function {other!r} seeds" for other, seeds in usual.seeds.items() for home in seeds}
+        for home, draw in draws.items():
+            text = f"Function {name!r} draws by {draw!r} from the random generator of {home}"
+            way_out = f"Seed it in {name!r}, or draw from np.random.default_rng(seed)."
+            seeded = {**cells, **functions}.get(home)
+            if seeded:
+                yield f"{text}, which {seeded}; in a service, other events draw from it in between. {way_out}", True
+            else:
+                yield f"{text}, which nothing seeds: a service draws the same in each event. {way_out}", False
 
 
 def _own_reasons(draft: Path, usual: ReplayReport, refused: Collection[str]) -> list[str]:

@@ -93,6 +93,7 @@ def changed_attributes(
                 # Not what a loop over a set has left behind in a module, nor what libraries do to each other.
                 is_changed = last.isupper() or "." in name or last in mentioned or f".{last}" in other
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
+                is_changed &= "." not in name or not _is_object_of(module, value, other)
                 is_changed |= last in named_here and name not in _left_by_loops(module)
                 is_changed &= other != value and (other != "None" or last in named_here)
                 is_changed &= not value.startswith(OF_NOTEBOOKS)
@@ -110,6 +111,11 @@ def _left_by_loops(module: str) -> frozenset[str]:
         return frozenset()
     parts = (part for loop in tree.body if isinstance(loop, ast.For) for part in ast.walk(loop))
     return frozenset(part.id for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store))
+
+
+def _is_object_of(module: str, *values: str) -> bool:
+    """Whether these describe objects or classes of a module's own package, as its own functions exchange them."""
+    return all(value.startswith(f"{module.partition('.')[0]}.") and " " not in value for value in values)
 
 
 def _mentioned(text: str) -> set[str]:

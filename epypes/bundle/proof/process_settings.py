@@ -20,6 +20,8 @@ from contextlib import suppress
 from contextvars import Context, copy_context
 from typing import Any, Final, NamedTuple
 
+from epypes.run.snapshot import is_global_generator
+
 # Only where a function catches warnings, errors in their place change what it computes.
 WARNINGS: Final = "warnings.simplefilter"
 # What the name of a variable of the context follows.
@@ -31,6 +33,14 @@ OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "
 # Code with one of these names may draw from a generator of the whole process, unless it makes its own.
 _DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
 _OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
+# The functions that draw from these generators or seed them, and that are no methods of one; the methods of objects of
+# SciPy and pandas that draw from NumPy's, unless they are given another one.
+_OF_GENERATORS: Final = {
+    "numpy.random": frozenset({"seed", "ranf", "sample"}),
+    "cv2": frozenset({"setRNGSeed", "randu", "randn", "randShuffle", "kmeans"}),
+}
+_METHODS_THAT_DRAW: Final = {"rvs": "scipy", "sample": "pandas"}
+_SEEDS: Final = frozenset({"seed", "setstate", "set_state", "setRNGSeed"})
 
 
 # -- the table of settings -------------------------------------------------------------------------------------------
@@ -194,9 +204,31 @@ def _set_environment(os: Any, variables: Mapping[bytes, bytes]) -> None:
     time.tzset()  # C code has its own copy of TZ
 
 
-def _of_functions(name: str, getter: str, words: str = "", by_keyword: bool = False, **more: Any) -> Setting:
-    """Return a setting that one function of a module reads and another one, which gives it its name, writes."""
+def _raising(errors: Mapping[str, str]) -> list[str]:
+    return sorted(error for error, way in errors.items() if way == "raise")
+
+
+def _dialects_reader(csv: Any) -> Callable[[], Any]:
+    return lambda: {name: csv.get_dialect(name) for name in csv.list_dialects()}
+
+
+def _set_dialects(csv: Any, dialects: Mapping[str, Any]) -> None:
+    for name in {*csv.list_dialects()} - dialects.keys():
+        csv.unregister_dialect(name)
+    for name, dialect in dialects.items():
+        csv.register_dialect(name, dialect)
+
+
+def _of_functions(
+    name: str, getter: str, words: str = "", by_keyword: bool = False, shown: Any = None, **more: Any
+) -> Setting:
+    """Return a setting that one function of a module reads and another one, which gives it its name, writes.
+
+    ``shown`` returns what promotion compares of a value.
+    """
     module, _, setter = name.rpartition(".")
+    if shown is not None:
+        more["texts"] = lambda value: {name: f"{shown(value)}"}
 
     def write(module: Any, value: Any) -> None:
         set_to = getattr(module, setter)
@@ -221,7 +253,7 @@ SETTINGS: Final = (
         is_quiet=lambda before, now: all(action != "error" for action, *_ in (*before, *now)),
     ),
     _of_functions("cv2.setNumThreads", "getNumThreads", is_quiet=_is_quiet),
-    _of_functions("cv2.setUseOptimized", "useOptimized", texts=lambda is_on: {"cv2.setUseOptimized": f"{is_on}"}),
+    _of_functions("cv2.setUseOptimized", "useOptimized", shown=bool),
     # As bytes: to decode all variables takes 20 us.
     Setting("os.environ", "os", lambda os: lambda: os.environ._data, _set_environment, frozenset({"os"})),
     _of_functions("os.chdir", "getcwd", "os"),
@@ -229,6 +261,17 @@ SETTINGS: Final = (
     Setting("decimal.getcontext", "decimal", _decimal_reader, _set_decimal, frozenset({"decimal"}), _decimal_text),
     # From NumPy 2 on these are variables of the context, which are all compared.
     _of_functions("numpy.seterr", "geterr", "seterr", by_keyword=True, texts=_errors_text, is_quiet=_raises_as),
+    _of_functions("scipy.special.seterr", "geterr", "seterr special", by_keyword=True, shown=_raising),
+    _of_functions("calendar.setfirstweekday", "firstweekday", "calendar", shown=int),
+    _of_functions("csv.field_size_limit", "field_size_limit", "csv", shown=int),
+    Setting(
+        "csv.register_dialect",
+        "csv",
+        _dialects_reader,
+        _set_dialects,
+        frozenset({"csv"}),
+        lambda dialects: {"csv.register_dialect": f"{sorted(dialects)}"},
+    ),
     _of_functions("numpy.set_printoptions", "get_printoptions", "set_printoptions", by_keyword=True, texts=_print_text),
     Setting(
         "pandas.set_option",
@@ -318,6 +361,22 @@ class ProcessSettings:
             with suppress(Exception):
                 one.write(sys.modules[one.module], known)
         return self.is_known()
+
+
+def global_generator(name: str, function: Any) -> tuple[str, bool]:
+    """Return whose generator of the whole process a function draws from or seeds, "" if none, and whether it seeds.
+
+    ``function`` is None for a method of an object that isn't known.
+    """
+    name, owner, home = getattr(function, "__name__", name), getattr(function, "__self__", None), ""
+    if function is None:
+        home = "numpy.random" if _METHODS_THAT_DRAW.get(name) in sys.modules else ""
+    elif is_global_generator(owner):
+        home = "random" if isinstance(owner, random.Random) else "numpy.random"
+    else:
+        known = (one for one, names in _OF_GENERATORS.items() if name in names)
+        home = next((one for one in known if function is getattr(sys.modules.get(one), name, None)), "")
+    return home, name in _SEEDS
 
 
 class GlobalGenerators:

@@ -55,6 +55,9 @@ class ReplayReport:
         What their modules hold, by module and attribute, if that was asked for.
     fingerprints
         Digests of the functions and of what they refer to, as the import of the module made them.
+    draws, seeds
+        By function the random generators of the whole process that it draws from without a seed, with the name by which
+        it draws; and those that it seeds.
     """
 
     samples: int
@@ -68,6 +71,8 @@ class ReplayReport:
     library_settings: Mapping[str, str] = field(default_factory=dict)
     libraries: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     fingerprints: Mapping[str, str] = field(default_factory=dict)
+    draws: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    seeds: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:

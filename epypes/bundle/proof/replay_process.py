@@ -35,6 +35,7 @@ from epypes.bundle.manifest import (
     own_packages,
     recorded_environment,
 )
+from epypes.bundle.proof.code_snapshot import CodeSnapshot
 from epypes.bundle.proof.compare import Difference, differences
 from epypes.bundle.proof.file_access import FileAccess
 from epypes.bundle.proof.fingerprint import Digester
@@ -172,6 +173,7 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
     new = sys.modules.keys() - before
     if with_libraries:
         _load_named(text, own)
+    random = {name: CodeSnapshot({name: function}, {}, lock=False) for name, function in bundle.cg.functions.items()}
     return replace(
         report,
         outside=access.files,
@@ -180,6 +182,11 @@ def _watched(folder: Path, *, with_libraries: bool) -> ReplayReport:
         notes=_unproved_lines(ran, folder),
         library_settings=library_settings(),
         fingerprints=fingerprints,
+        draws={
+            name: {home: draw for draw, home in one.draws.items() if home not in one.seeds}
+            for name, one in random.items()
+        },
+        seeds={name: sorted(one.seeds) for name, one in random.items()},
     )
 
 

@@ -54,6 +54,7 @@ from epypes.bundle.source.resolve import (
 )
 from epypes.pipeline import Node
 from epypes.run import CompGraphRunner
+from epypes.run.snapshot import cached_properties
 
 # By these a function reads annotations or docstrings, which otherwise change nothing.
 _READS_ANNOTATIONS: Final = frozenset(
@@ -218,6 +219,7 @@ class _Walk:
             is_installed_module = isinstance(ours, types.ModuleType) and is_installed(ours.__name__)
             if is_installed_module or isinstance(ours, CompGraphRunner):
                 raise TypeError("what a module holds, and a runner's last run, is no part of its description")
+            _compute_cached(ours, theirs)
             mine, others = describe(ours), describe(theirs)
         except Exception as error:  # whatever an object of a library raises that can't be copied
             text = f"{path.name} is a {type(ours).__name__!r}, made anew in the module, which can't be compared."
@@ -316,6 +318,13 @@ def _without(parts: Mapping[str, Any], left_out: tuple[str, ...]) -> dict[str, A
 
 def _annotations_in(parts: Mapping[str, Any]) -> dict[str, Any]:
     return {label: part for label, part in parts.items() if label.startswith(ANNOTATION)}
+
+
+def _compute_cached(ours: Any, theirs: Any) -> None:
+    """Have an object of the module compute what the notebook's has kept of its cached properties."""
+    if not is_installed(type(ours).__module__):
+        for name in cached_properties(type(ours)) & getattr(ours, "__dict__", {}).keys():
+            getattr(theirs, name)
 
 
 def _has_nan(key: Any) -> bool:

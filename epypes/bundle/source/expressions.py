@@ -12,18 +12,21 @@ import keyword
 import logging
 import pathlib
 import re
+import sys
 import types
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import date, datetime, time, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
-from epypes.bundle.source.resolve import Importable, Refused, importable
+from epypes.bundle.source.resolve import Importable, Refused, assignment_of, evaluated, importable, names_of
+from epypes.bundle.source.side_effects import changes_itself
 from epypes.nothing import Nothing
+from epypes.pipeline import Node
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
@@ -141,11 +144,18 @@ def literal_value(expression: ast.expr) -> Any:
 
 # Their objects know the call that makes them.
 _KNOW_THEIR_CALL: Final = (
-    range, slice, itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal, logging.Logger,
+    range, slice, itemgetter, attrgetter, methodcaller, timedelta, timezone, Fraction, Decimal, logging.Logger,
 )  # fmt: skip
+_PARTS_OF_DATES: Final = {
+    date: ("year", "month", "day"),
+    time: ("hour", "minute", "second", "microsecond", "tzinfo"),
+    datetime: ("year", "month", "day", "hour", "minute", "second", "microsecond", "tzinfo"),
+}
 # More numbers are too many to read.
 _MOST_NUMBERS: Final = 200
 _MOST_CHARACTERS: Final = 400
+# Objects of these are what their classes make of the arguments; nothing else is done to them.
+_OF_THEIR_ARGUMENTS: Final = ("scipy.interpolate.", "scipy.spatial.", "skimage.transform.")
 _ARRAY: Final = re.compile(r'array\(.*?"\)')
 
 
@@ -172,6 +182,14 @@ def expression(gathered: Slice, value: Any, what: str, wanted: str = "") -> str:
     try:
         return _Writer(gathered, what, wanted).write(value)
     except (ValueError, RecursionError):  # as for what holds itself, or is nested deeper than Python reads
+        return ""
+
+
+def constructed(gathered: Slice, value: Any, what: str) -> str:
+    """Return the call of its class by which a cell has made an object; "" if there is none, or more was done."""
+    try:
+        return _Writer(gathered, what, "").constructed(value)
+    except (ValueError, RecursionError):
         return ""
 
 
@@ -248,12 +266,29 @@ class _Writer:
             return f"{self.write(origin)}[{'...' if given == [...] else self.write(given)}, {self.write(result)}]"
         if origin is not None:
             return f"{self.write(origin)}[{self._joined(value.__args__)}]"
-        home = importable(value)
+        home = importable(value, *names_of(value, vars(types)))
         if home is not None:
             return gathered.reference(home, what)
         if isinstance(value, type):
             return gathered.add_class(value, what)
-        return gathered.add_function(value, what, self.wanted) if callable(value) else ""
+        made = self.constructed(value)
+        return made or (gathered.add_function(value, what, self.wanted) if callable(value) else "")
+
+    def constructed(self, value: Any) -> str:
+        """Return the call of its class by which a cell has made an object; "" if that is not all that was done."""
+        kind, names = type(value), self.gathered.notebook or vars(sys.modules["__main__"])
+        is_own = kind.__module__ == "__main__" and not isinstance(value, Node) and not changes_itself(kind)
+        if not is_own and not kind.__module__.startswith(_OF_THEIR_ARGUMENTS):
+            return ""
+        given = next(filter(None, (assignment_of(name, names) for name in names_of(value, names))), None)
+        call = given[0].value if given is not None else None
+        if not isinstance(call, ast.Call) or evaluated(call.func, names) is not kind:
+            return ""
+        if not all(each.arg for each in call.keywords):
+            return ""
+        arguments = [self.write(_value_of(argument, names)) for argument in call.args]
+        arguments += [f"{each.arg}={self.write(_value_of(each.value, names))}" for each in call.keywords]
+        return f"{self.write(kind)}({', '.join(arguments)})"
 
     def _record(self, value: Any) -> str:
         """Return the expression of a member of an enumeration, a dataclass's object or a named tuple; "" for others.
@@ -265,6 +300,9 @@ class _Writer:
             if isinstance(value, enum.Flag) and value.name not in kind.__members__:
                 return " | ".join(map(self.write, value))
             return f"{self.gathered.add_class(kind, what)}.{value.name}"
+        if kind is types.SimpleNamespace:
+            given = ", ".join(f"{name}={self.write(part)}" for name, part in vars(value).items())
+            return f"{self.write(kind)}({given})"
         if not dataclasses.is_dataclass(kind) and not (isinstance(value, tuple) and hasattr(kind, "_fields")):
             return ""
         defaults = {name: one.default for name, one in inspect.signature(kind).parameters.items()}
@@ -278,7 +316,10 @@ class _Writer:
         source = ""
         # No list has the shape of a matrix without numbers.
         is_small = array.size <= _MOST_NUMBERS and (array.size > 0 or array.ndim == 1)
-        listed = literal_source(array.tolist()) if is_small and array.dtype.kind in "biufc" else ""
+        kind = quoted(str(array.dtype)) if array.dtype.names is None else literal_source(array.dtype.descr)
+        is_small &= array.dtype.names is None or "('', " not in kind  # what pads its fields
+        parts = array.astype(str) if array.dtype.kind == "M" else array
+        listed = literal_source(parts.tolist()) if is_small and array.dtype.kind in "biufcMSUV" else ""
         if listed:
             if not array.flags.c_contiguous and not array.flags.f_contiguous:
                 raise Refused(
@@ -287,9 +328,18 @@ class _Writer:
                 )
             order = "" if array.flags.c_contiguous else ', order="F"'
             numpy = self.gathered.module_name("numpy", self.what)
-            source = f'{numpy}.array({listed}, dtype="{array.dtype}"{order})'
+            source = f"{numpy}.array({listed}, dtype={kind}{order})"
         is_text = source and len(source) <= _MOST_CHARACTERS
         return source if is_text else self.gathered.store_array(array, self.wanted or "array", self.what) or source
+
+
+def _value_of(argument: ast.expr, names: Mapping[str, Any]) -> Any:
+    """Return the value of an argument that is a literal, a name, or a tuple or list of these; UNKNOWN for others."""
+    if isinstance(argument, ast.Tuple | ast.List):
+        values = [_value_of(part, names) for part in argument.elts]
+        return values if isinstance(argument, ast.List) else tuple(values)
+    value = literal_value(argument)
+    return evaluated(argument, names) if isinstance(argument, ast.Name | ast.Attribute) else value
 
 
 def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
@@ -305,18 +355,26 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
         flags = re.RegexFlag(value.flags & ~re.UNICODE)
         return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
-        return pathlib.Path, (str(value),)
+        return pathlib.Path if isinstance(value, pathlib.Path) else kind, (str(value),)
+    if kind is types.MappingProxyType:
+        return kind, (dict(value),)
+    if kind in _PARTS_OF_DATES and not getattr(value, "fold", 0):
+        return kind, tuple(getattr(value, name) for name in _PARTS_OF_DATES[kind])
     if kind in _KNOW_THEIR_CALL:
         made_by, arguments = value.__reduce__()[:2]
         return made_by, arguments
-    if kind.__module__.partition(".")[0] == "numpy":
-        import numpy as np
+    return _call_of_numpy(value) if kind.__module__.partition(".")[0] == "numpy" else None
 
-        if isinstance(value, np.dtype):
-            return np.dtype, (value.str if value.names is None else value.descr,)
-        if isinstance(value, np.number | np.bool_):
-            return kind, (value.item(),)
-    return None
+
+def _call_of_numpy(value: Any) -> tuple[Any, tuple[Any, ...]] | None:
+    import numpy as np
+
+    if isinstance(value, np.dtype):
+        return np.dtype, (value.str if value.names is None else value.descr,)
+    if isinstance(value, np.datetime64 | np.timedelta64):
+        number = "NaT" if np.isnat(value) else int(value.astype(np.int64))
+        return type(value), (number, np.datetime_data(value.dtype))
+    return (type(value), (value.item(),)) if isinstance(value, np.number | np.bool_ | np.character) else None
 
 
 # -- line breaks -------------------------------------------------------------------------------------------------------

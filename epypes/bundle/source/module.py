@@ -110,6 +110,9 @@ def write_module(
     gathered, (references, delays) = gather(write, reserved, stores_arrays=True)
     modules = OwnModules(sorted(gathered.modules))
     modules.check([*cg.functions.values(), *adapters.values(), *enums.values(), pipeline], gathered.patches)
+    for name in modules.registering:
+        with gathered.noted_refusals():
+            gathered.import_module(name)
     if gathered.refusals or modules.refusals:
         return "", (), list(dict.fromkeys([*gathered.refusals, *modules.refusals]))
     module = emit_module(settings, cg, gathered, references, delays)

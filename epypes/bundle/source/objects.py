@@ -367,7 +367,9 @@ def _library_object(value: Any) -> Description:
 
 
 def _without_computed(kind: type, state: Any) -> Any:
-    """Return a state without what is computed from the rest when it is first needed."""
+    """Return a state without what is computed from the rest when it is first needed, and without addresses."""
+    if type(state) is tuple and any(base.__name__ == "cKDTree" for base in kind.__mro__):
+        return state[1:]  # the nodes, which are in the order of the indices that follow, point to each other
     if type(state) is tuple and len(state) == 2 and type(state[0]) is dict:
         return _without_computed(kind, state[0]), state[1]
     computed = {*cached_properties(kind), *({"_ufunc"} if (kind.__module__, kind.__name__) == _VECTORIZE else ())}

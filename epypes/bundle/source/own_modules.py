@@ -127,10 +127,14 @@ class OwnModules:
     ----------
     refusals
         Why they can't be taken along.
+    registering
+        Those that no import statement of the others names, by the names that Python knows them by: what they have was
+        registered with the others, or is imported only when it is asked for.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
         self.refusals: list[str] = []
+        self.registering: list[str] = []
         self._files: dict[str, bytes | Path] = {}
         self._modules: dict[str, OwnModule] = {}
         self._seen: set[str] = set()
@@ -214,10 +218,12 @@ class OwnModules:
         if not self._modules:
             return
         functions = sorted(functions_reached_by(values), key=lambda function: function.__code__.co_filename)
-        # A package may import what a function needs only when it is asked for, by a name that no text has.
+        # What a module has registered, or a package imports only when it is asked for, has a home that no text names.
         homes = {str(function.__globals__.get("__name__")): function.__globals__ for function in functions}
         loaded = {name: loaded_module(name) for name in homes if name != "__main__"}
+        named = {*self._modules}
         self._collect(name for name, module in loaded.items() if module and vars(module) is homes[name])
+        self.registering += [name for name in loaded if plain_name(name) in self._modules.keys() - named]
         by_file = {str(module.file): module for module in self._modules.values()}
         own_patches = {
             key: place

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Final
 
-from epypes.bundle.private_import import name_meant
+from epypes.bundle.private_import import loaded_module, name_meant
 
 # A class reads the name of the module around it, whichever that is, and has its own annotations.
 _OF_EVERY_CLASS: Final = frozenset({"__name__", "__annotations__"})
@@ -132,6 +132,28 @@ def defaults_of(function: types.FunctionType) -> dict[str, Any]:
     given, code = function.__defaults__ or (), function.__code__
     names = code.co_varnames[: code.co_argcount]
     return dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
+
+
+def attributes_loaded(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+    """Give the attributes that a function loads, by name; what a module has under the name, None for other objects."""
+    for code in nested_codes(function.__code__):
+        known, value = meanings_of(function, code.co_names + code.co_freevars), None
+        for step in dis.get_instructions(code):
+            operation, name = step.opname, step.argval
+            if operation in ("LOAD_ATTR", "LOAD_METHOD", "IMPORT_FROM"):
+                # NumPy loads its generators when they are first asked for; other parts are left as they are.
+                found = getattr(value, name, None) if name == "random" else getattr(value, "__dict__", {}).get(name)
+                found = found if isinstance(value, types.ModuleType) else None
+                yield name, found
+                value = value if operation == "IMPORT_FROM" else found
+            elif operation == "IMPORT_NAME":
+                value = loaded_module(name)
+            elif operation == "STORE_FAST":
+                known[name] = value
+            elif operation.startswith(("LOAD_FAST", "LOAD_GLOBAL", "LOAD_NAME", "LOAD_DEREF")):
+                value = known.get(name) if isinstance(name, str) else None
+            elif operation not in ("PUSH_NULL", "CACHE", "NOP"):
+                value = None
 
 
 def is_model_of_cv2(value: Any) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import builtins
 import inspect
+import os
 import sys
 import types
 from collections import deque
@@ -17,6 +18,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 from epypes.bundle.private_import import loaded_module
+from epypes.bundle.proof.process_settings import global_generator
 from epypes.bundle.source.references import global_names, module_of_import, namespace_of
 from epypes.bundle.source.resolve import (
     Definition,
@@ -24,6 +26,7 @@ from epypes.bundle.source.resolve import (
     definition_of,
     evaluated,
     executed_cells,
+    functions_of,
     is_of_notebook,
     parsed,
     place_in,
@@ -44,8 +47,14 @@ CHANGING: Final = frozenset(
         *("append", "appendleft", "extend", "extendleft", "insert", "pop", "popleft", "popitem", "remove", "clear"),
         *("update", "setdefault", "add", "discard", "sort", "reverse", "fill", "itemset", "put", "resize"),
         *("difference_update", "intersection_update", "symmetric_difference_update", "setfield", "setflags"),
+        "register",
     }
 )
+# Methods that make an object.
+_MAKING: Final = frozenset({"__init__", "__post_init__", "__new__", "__init_subclass__"})
+# By these a function reads the environment; by these calls a cell changes it.
+_READS_ENVIRONMENT: Final = (os.environ, os.getenv, os.path.expandvars)
+_SETS_ENVIRONMENT: Final = frozenset({"putenv", "unsetenv", "load_dotenv"})
 
 
 def check_state(found: Definition) -> None:
@@ -84,6 +93,20 @@ def _check_writes(node: ast.AST, file: str, function: types.FunctionType | None,
                 text = f"{what} writes into {name!r}, which outlives the call ({place_in(file, written.lineno)})"
                 text = f"{text}: the next event would find it different. Write into a copy of it."
                 raise Refused(f"{text} {_as_state(name, names)}")
+
+
+def changes_itself(kind: type) -> bool:
+    """Whether methods of a user's class write into its objects, or into the class, after these have been made."""
+    own = [base for base in kind.__mro__ if base.__module__ == kind.__module__]
+    for name, function in (method for base in own for method in functions_of(base).items()):
+        node, first = definition_of(function.__code__)[1], function.__code__.co_varnames[:1]
+        parts = ast.walk(node) if node is not None and name not in _MAKING else ()
+        for base in (written for part in parts for written in _written(part)):
+            while isinstance(base, ast.Subscript | ast.Attribute):
+                base = base.value
+            if any(isinstance(part, ast.Name) and part.id in first for part in ast.walk(base)):
+                return True
+    return False
 
 
 def _as_state(name: str, names: Mapping[str, Any]) -> str:
@@ -181,8 +204,12 @@ def check_reads(found: Definition, known: Patches) -> None:
     # A module or class by itself, as in getattr(module, name), may be asked for any name.
     dotted = {id(node.value) for node in ast.walk(found.node) if isinstance(node, ast.Attribute)}
     changed = {id(owner): (owner, name, place) for (owner, name), place in known.items()}
+    place = known.get((os, "environ"), "")
+    changed |= {id(one): (os, "environ", place) for one in _READS_ENVIRONMENT if place}
     for node in ast.walk(found.node):
-        if isinstance(node, ast.Name | ast.Attribute) and id(node) not in dotted:
+        if isinstance(node, ast.Name | ast.Attribute) and (
+            id(node) not in dotted or evaluated(node, names) is os.environ
+        ):
             owner, name, place = changed.get(id(evaluated(node, names)), (None, "", ""))
             if owner is not None:
                 raise _patched(found.what, f"{owner.__name__}.{name}", place)
@@ -205,6 +232,9 @@ def check_home(module: str, qualname: str, what: str, known: Patches) -> None:
 
 
 def _patched(what: str, name: str, place: str) -> Refused:
+    if name == "os.environ":
+        text = f"{what} reads the environment, which the notebook has changed ({place}); a service has its own"
+        return Refused(f"{text}. Read it in the notebook, and make the value a token.")
     text = f"{what} uses {name!r}, which the notebook has changed ({place}); a service has it as it was installed"
     return Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
 
@@ -234,7 +264,8 @@ def _place_of_patch(known: Patches, owner: Any, name: str, otherwise: str) -> st
 
 def _is_patched(owner: Any, name: str) -> bool:
     """Whether a module has a function, class or mock of the notebook, in whatever way that was put there."""
-    value = vars(owner).get(name) if isinstance(owner, types.ModuleType) and owner.__name__ != "__main__" else None
+    is_library = isinstance(owner, types.ModuleType) and owner.__name__ not in ("__main__", "unittest.mock")
+    value = vars(owner).get(name) if is_library else None
     is_own = isinstance(value, types.FunctionType) and value.__globals__.get("__name__") == "__main__"
     homes = (getattr(value, "__module__", ""), type(value).__module__)
     return is_own or not {"__main__", "unittest.mock"}.isdisjoint(home for home in homes if isinstance(home, str))
@@ -243,6 +274,11 @@ def _is_patched(owner: Any, name: str) -> bool:
 def patches_in_notebook() -> Patches:
     """Return what the notebook has changed, by module or class of a library and name there, each with its place."""
     return patches_in(_cells(), vars(sys.modules["__main__"]))
+
+
+def environment_changed() -> str:
+    """Return where cells have changed the environment; "" if they have not."""
+    return patches_in_notebook().get((os, "environ"), "")
 
 
 def patches_in(texts: Iterable[tuple[str, str]], names: Mapping[str, Any]) -> Patches:
@@ -259,7 +295,17 @@ def patches_in(texts: Iterable[tuple[str, str]], names: Mapping[str, Any]) -> Pa
                     found[owner, node.attr] = f"{cell}, line {written.lineno}"
                     break
                 node = node.value
+            if _sets_environment(written) or evaluated(node, names) is os.environ:
+                found[os, "environ"] = f"{cell}, line {written.lineno}"
     return found
+
+
+def _sets_environment(node: ast.expr) -> bool:
+    """Whether a call, also of a magic, sets variables of the environment."""
+    if not isinstance(node, ast.Call):
+        return False
+    name, first = ast.unparse(node.func).rpartition(".")[2], getattr(next(iter(node.args), None), "value", "")
+    return name in _SETS_ENVIRONMENT or (name == "run_line_magic" and first in ("env", "set_env"))
 
 
 def _cells() -> Iterator[tuple[str, str]]:
@@ -272,7 +318,9 @@ def _cells() -> Iterator[tuple[str, str]]:
 @lru_cache(maxsize=512)  # every function of a graph asks for every cell
 def _written_in(text: str) -> list[ast.expr]:
     tree = parsed(text)
-    return [written for node in ast.walk(tree) for written in _written(node)] if tree else []
+    nodes = [*ast.walk(tree)] if tree else []
+    calls = [node for node in nodes if isinstance(node, ast.Call) and _sets_environment(node)]
+    return [*calls, *(written for node in nodes for written in _written(node))]
 
 
 def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str]]:
@@ -285,6 +333,21 @@ def _read_by(tree: ast.AST, names: Mapping[str, Any]) -> Iterator[tuple[Any, str
                 yield evaluated(read.value, names), read.attr
             elif isinstance(read, ast.Name):
                 yield builtins, read.id
+
+
+def seeds_in_notebook() -> dict[str, str]:
+    """Return the random generators of the whole process that the cells seed outside of functions, with the places."""
+    found, names = dict[str, str](), {**sys.modules, **vars(sys.modules["__main__"])}
+    for cell, text in _cells():
+        waiting: list[ast.AST] = [*filter(None, [parsed(text)])]
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, ast.Call) and (function := evaluated(node.func, names)) is not None:
+                home, is_seed = global_generator("", function)
+                found |= {home: f"{cell}, line {node.lineno}"} if home and is_seed else {}
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.Lambda):
+                waiting += ast.iter_child_nodes(node)
+    return found
 
 
 def places_of_change() -> tuple[dict[str, str], dict[str, str]]:

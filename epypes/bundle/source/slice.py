@@ -23,6 +23,7 @@ from epypes.bundle.private_import import import_module, loaded_module, plain_nam
 from epypes.bundle.source.expressions import (
     LINE,
     UNKNOWN,
+    constructed,
     expression,
     identifier_of,
     is_data,
@@ -139,6 +140,8 @@ class Slice:
         Why something can't be promoted.
     patches
         What the notebook has changed in libraries.
+    notebook
+        The names of the notebook, once a definition was met.
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED, *, stores_arrays: bool = False) -> None:
@@ -154,7 +157,7 @@ class Slice:
         self._known: dict[int, str] = {}
         self._unfinished: set[str] = set()
         self._makers: dict[tuple[str, str], str] = {}
-        self._notebook: Mapping[str, Any] = {}
+        self.notebook: Mapping[str, Any] = {}
 
     def noted_refusals(self) -> AbstractContextManager[None]:
         """Note what is refused inside, and go on after it."""
@@ -218,7 +221,7 @@ class Slice:
         """Import a module, under the name that functions or the notebook have for it (``np``); return that name."""
         value, plain = import_module(module), plain_name(module)
         imported = [name for name, known in self.imports if known == module]
-        names = [name for name, known in self.read.items() if known is value] or names_of(value, self._notebook)
+        names = [name for name, known in self.read.items() if known is value] or names_of(value, self.notebook)
         if not imported and plain not in names:
             imported = [name for name in names if self._is_free(name, value)]
         name = min(imported, default=plain)
@@ -232,6 +235,10 @@ class Slice:
         self.claim(bound, _of_object(loaded_module(home)), what)
         self.modules.add(module)
         self.imports[name, module] = f"import {plain}{named}"
+
+    def import_module(self, module: str) -> None:
+        """Import a module of the user for what it does when it is imported."""
+        self._import_module(module, plain_name(module), f"Module {plain_name(module)!r}")
 
     def store_array(self, array: Any, name: str, what: str) -> str:
         """Store an array as a file; return the call that reads it, or "" if files can't hold it or there are none."""
@@ -250,11 +257,16 @@ class Slice:
         if home is not None:
             return self.reference(home, what)
         if id(kind) not in self._known:
-            found = class_definition(kind, self._notebook or vars(sys.modules["__main__"]), what)
+            found = class_definition(kind, self.notebook or vars(sys.modules["__main__"]), what)
             check_state(found)
             self.claim(kind.__name__, _of_object(kind), f"{what.rstrip(',')} ({found.place_in(found.node)})")
             self._known[id(kind)] = kind.__name__
             self._write(kind.__name__, _text(found, kind.__name__), found)
+            # The statements of these register them with it.
+            registered: list[type] = kind.__subclasses__() if "__init_subclass__" in vars(kind) else []
+            for derived in registered:
+                if found.names.get(derived.__name__) is derived:
+                    self.add_class(derived, f"Class {derived.__name__!r}, which is derived from {kind.__name__!r},")
         return self._known[id(kind)]
 
     def add_function(self, function: Any, what: str, wanted: str = "") -> str:
@@ -267,8 +279,10 @@ class Slice:
         name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)
         is_bound = isinstance(function, types.MethodType | types.BuiltinMethodType)
         can_be_read = isinstance(owner, type) or (name not in CHANGING and literal_source(owner))
-        if is_bound and can_be_read and getattr(owner, name, None) == function:
-            source = expression(self, owner, f"What {what[0].lower()}{what[1:]} is of")
+        is_bound = is_bound and getattr(owner, name, None) == function
+        write = expression if can_be_read else constructed
+        source = write(self, owner, f"What {what[0].lower()}{what[1:]} is of") if is_bound else ""
+        if source:
             return f"{f'({source})' if source[0].isdecimal() or source[0] == '-' else source}.{name}"
         if type(function) is partial:
             inner = f"The function of {what[0].lower()}{what[1:]}"
@@ -284,7 +298,7 @@ class Slice:
         """Add a function that has a text; return its name."""
         found = function_definition(function, what)
         check_state(found)
-        self._notebook = self._notebook or found.names
+        self.notebook = self.notebook or found.names
         name = self._name_for(function, found, wanted)
         self.claim(name, _of_object(function), what)
         self._known[id(function)] = name
@@ -299,7 +313,19 @@ class Slice:
         else:
             self._write(name, _text(found, name), found)
         self._unfinished.discard(name)
+        self._register_implementations(name, function, found)
         return name
+
+    def _register_implementations(self, name: str, function: Any, found: Definition) -> None:
+        """Write the calls that register the implementations of a function of ``functools.singledispatch``."""
+        registry, lines = getattr(function, "registry", None), list[str]()
+        for kind, made in registry.items() if isinstance(registry, types.MappingProxyType) else ():
+            if made is not function.__wrapped__:
+                what = f"The implementation of {found.what[0].lower()}{found.what[1:]} for {kind.__name__!r}"
+                written = self._argument(made, what, f"{name}_{kind.__name__}")
+                lines.append(f"{name}.register({expression(self, kind, what)}, {written})")
+        if lines:
+            self.define(f"{name}.register", "\n".join(lines), position=_position(found))
 
     def _write_closure(self, name: str, inner: str, given: Mapping[str, str], found: Definition) -> None:
         """Write a closure as what a function returns that takes what it has captured; closures of one text share it."""
@@ -361,7 +387,7 @@ class Slice:
 
     def _write(self, name: str, text: str, found: Definition, own: Collection[str] = ()) -> None:
         """Write a definition, after what it reads from outside but for the names that are its own."""
-        self._notebook = self._notebook or found.names
+        self.notebook = self.notebook or found.names
         check_reads(found, self.patches)
         read = [one for one in found.reads() if one not in own]
         self.modules.update(imports_in(found.node, found.names))

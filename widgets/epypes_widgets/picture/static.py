@@ -36,7 +36,7 @@ _FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outli
 _KEPT: Final = (
     "<style>.jp-OutputArea-child:not(:has(.epypes-view:not(.epypes-void), .epypes-picker))"
     ":has(+ .jp-OutputArea-child .epypes-kept) {display: none}</style>"
-    '<p style="margin:0 0 8px">Kept from the last run: run this cell again to go on.</p>'
+    '<p style="margin:0 0 8px">Kept from the last run: run the cells up to this one to go on.</p>'
 )
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
 

@@ -1,8 +1,8 @@
 // Whether the kernel of a panel is still there.
 
-const RESTARTED = "The kernel was restarted: run this cell again.";
-const GONE = "The kernel of this panel has ended: run this cell again.";
-const LATE = "The kernel does not answer: it is busy, or was restarted. After a restart run this cell again.";
+const RESTARTED = "The kernel was restarted: run the cells again, up to this one.";
+const GONE = "The kernel of this panel has ended: run the cells again, up to this one.";
+const LATE = "The kernel does not answer: it is busy, or was restarted. After a restart run the cells again, up to this one.";
 /** After that long without a message the kernel is asked, and is late after as long again. */
 const SILENCE_MS = 5_000;
 /** Statuses of JupyterLab's kernels after which no widget is answered any more. */

@@ -192,7 +192,7 @@ function render({ model, el }) {
     answered();
     figure.classList.add("epypes-ended");
     figure.classList.toggle("epypes-void", stage.picture.hidden && stage.text.hidden);
-    if (given) setup({ ...given.message, closed: true }, given.buffers);
+    if (given) setup({ ...given.message, token: panel.state.token, closed: true }, given.buffers);
     stage.wait("");
     header.failure(null);
     header.tell(text);
