@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 import struct
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import MessageError
@@ -85,7 +86,7 @@ def write_table(writer: ValueWriter, message: Any, value: Any, path: Path) -> No
         why = "; ".join(map(str, error.args)) if isinstance(error, arrow.ArrowException) else str(error)
         text = f"that Arrow can't hold: {why:.200}. Return table.to_dict('list') instead"
         raise _no_codec(path, text) from error
-    writer.counter.count(path, batch.num_rows * objects)
+    writer.counter.count(path, batch.num_rows * objects + _object_categories(arrow, [[each] for each in batch.columns]))
     sink = arrow.BufferOutputStream()
     with arrow.ipc.new_stream(sink, batch.schema) as stream:
         stream.write_batch(batch)
@@ -196,7 +197,7 @@ def read_arrow_table(reader: ValueReader, content: Any, path: Path) -> Any:
         objects = _object_columns(arrow, stream.schema)
         table = stream.read_all()
         # Without columns nothing else bounds the rows, and categories that are null take no bytes.
-        categories = sum(_object_categories(arrow, column) for column in table.columns)
+        categories = _object_categories(arrow, [column.chunks for column in table.columns])
         reader.counter.count(path, table.num_rows * (objects or not table.num_columns) + categories)
         table.validate(full=True)
         frame = _frame_of(table, content.numbered)
@@ -218,24 +219,28 @@ def _frame_of(table: Any, is_numbered: bool) -> Any:
 
 def _object_columns(arrow: Any, schema: Any) -> int:
     """Return how many columns have values that are objects in pandas; raise ValueError for another type of Arrow."""
-
-    def is_one_of(kind: Any, names: tuple[str, ...]) -> bool:
-        return any(getattr(arrow.types, f"is_{name}")(kind) for name in names)
-
     count = 0
     for column in schema:
         kind = column.type.value_type if arrow.types.is_dictionary(column.type) else column.type
-        if not is_one_of(kind, (*_PLAIN_TYPES, *_OBJECT_TYPES)):
+        if not _is_one_of(arrow, kind, (*_PLAIN_TYPES, *_OBJECT_TYPES)):
             raise ValueError(f"column {column.name!r:.80} is of Arrow's type {kind!s:.60}")
-        count += is_one_of(kind, _OBJECT_TYPES)
+        count += _is_one_of(arrow, kind, _OBJECT_TYPES)
     return count
 
 
-def _object_categories(arrow: Any, column: Any) -> int:
-    """Return how many categories, which are objects in pandas, a column of Arrow has."""
-    if not arrow.types.is_dictionary(column.type):
-        return 0
-    return max((len(chunk.dictionary) for chunk in column.chunks), default=0)
+def _object_categories(arrow: Any, columns: Sequence[Sequence[Any]]) -> int:
+    """Return how many categories are objects in pandas; ``columns`` has the arrays of each column."""
+    return sum(
+        max(len(array.dictionary) for array in arrays)
+        for arrays in columns
+        if arrays
+        and arrow.types.is_dictionary(arrays[0].type)
+        and _is_one_of(arrow, arrays[0].type.value_type, _OBJECT_TYPES)
+    )
+
+
+def _is_one_of(arrow: Any, kind: Any, names: tuple[str, ...]) -> bool:
+    return any(getattr(arrow.types, f"is_{name}")(kind) for name in names)
 
 
 def _is_compressed(metadata: bytes) -> bool:

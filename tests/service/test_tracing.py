@@ -131,7 +131,7 @@ def test_a_processor_that_raises_and_an_exporter_that_blocks_hold_no_event_up(bu
                 for number in range(8):
                     peer.requests.put(Envelope("x", {"number": number}))
                     assert peer.take()[0].parts["out"] == 2 * number
-        assert exporter.entered.is_set()
+        assert exporter.entered.wait(60)
     finally:
         exporter.released.set()
         blocked.shutdown()

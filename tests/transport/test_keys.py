@@ -183,7 +183,8 @@ def test_one_that_connects_must_know_one_server(tmp_path):
         ZMQSubscriber("tcp://127.0.0.1:5555", queue.SimpleQueue(), keys=keys, allow=["a" * 40, "b" * 40])
 
 
-def test_a_file_without_keys_is_named(tmp_path):
-    (tmp_path / "x.key").write_text("hello")
+@pytest.mark.parametrize("text", ["hello", "public-key\n", 'public-key = "short"'])
+def test_a_file_without_keys_is_named(tmp_path, text):
+    (tmp_path / "x.key").write_text(text)
     with pytest.raises(KeysError, match=r"x\.key is no key file"):
         ZMQPublisher(LOCAL, queue.SimpleQueue(), keys=make_keys(tmp_path / "me"), allow=tmp_path / "x.key")

@@ -217,6 +217,12 @@ def test_categories_without_bytes_are_counted(count):
     assert caught.value.reason == "too many values"
 
 
+def test_categories_are_counted_where_they_are_written():
+    labels = pd.DataFrame({"x": pd.Categorical(["a"], [f"{number}" for number in range(600)] + ["a"])})
+    with pytest.raises(MessageError, match="more than 600 values"):
+        encode(Envelope("", {"v": labels}), limits=Limits(values=600))
+
+
 def test_a_text_that_is_not_unicode_is_named_in_an_error_that_can_be_printed():
     with pytest.raises(MessageError, match=r"can't encode character '\\ud800'") as caught:
         encode(Envelope("", {"v": pd.DataFrame({"what": pd.Series(["\ud800"], dtype=object)})}))
