@@ -149,8 +149,10 @@ def find_problems(
     yield from _check_producers(digraph)
     if not is_acyclic:
         cycle = digraph.shortest_cycle()
+        # A function may be called like its token.
+        vertices = [f"{name}()" if place % 2 else name for place, name in enumerate(cycle)]
         text = (
-            f"The graph has a cycle: {' -> '.join(cycle)}. "
+            f"The graph has a cycle: {' -> '.join(vertices)}. "
             "Rename one of these tokens, or split the function that both needs and makes it."
         )
         yield Finding("cycle", text, cycle)
