@@ -2,8 +2,7 @@
 
 A table is written only if Arrow gives it back as it was, since a replay compares every bit: a column that Arrow would
 change is refused with the way out. The frequency of an index of times and the flags of a table are no data and are left
-out. Tables that were written before column by column, in bundles and recordings, are
-read.
+out. Tables that were written before column by column, in bundles and recordings, are read.
 
 Nothing in a received stream is trusted: compressed ones are refused, since 15 kB can be 480 MB, so are columns of other
 types than those that pandas makes, and values that are objects are counted.

@@ -45,7 +45,9 @@ def test_a_function_may_be_called_like_a_token():
 def test_a_cycle_is_refused_with_its_shortest_way_round():
     functions = dict.fromkeys(["f", "g", "h", "start"], identity)
     io = {"start": ("x", "y"), "f": (("a",), "b"), "g": ("b", "c"), "h": ("c", "a")}
-    with pytest.raises(GraphError, match=r"The graph has a cycle: a -> f\(\) -> b -> g\(\) -> c -> h\(\) -> a\. Rename") as error:
+    with pytest.raises(
+        GraphError, match=r"The graph has a cycle: a -> f\(\) -> b -> g\(\) -> c -> h\(\) -> a\. Rename"
+    ) as error:
         ep.CompGraph(functions, io)
     assert kinds(error) == ["cycle"]
 
