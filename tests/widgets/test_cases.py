@@ -193,10 +193,11 @@ def test_cases_without_checks_are_test_images_only(
 
 
 def test_closing_ends_the_check(runner: ep.CompGraphRunner, cases: list[ep.Case]) -> None:
+    before = frozenset(threading.enumerate())  # also those of other tests' panels
     panel = tune(runner, cases=cases)
     panel.close(TIMEOUT_S)
     panel.close(TIMEOUT_S)
-    until(lambda: not [thread for thread in threading.enumerate() if thread.name == "epypes-cases"])
+    until(lambda: not [thread for thread in {*threading.enumerate()} - before if thread.name == "epypes-cases"])
 
 
 def test_what_can_t_be_shown_or_checked_is_refused(
