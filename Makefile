@@ -23,7 +23,7 @@ test: $(VENV)/.test chromium postgres brokers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	@sh .ci/matrix $(BIN)/python 3.13 lowest
+	@sh .ci/matrix $(BIN)/python lowest
 	$(PYTEST) -m "not soak"
 
 # The long forms: every combination, long series, and far more examples for what searches at random:

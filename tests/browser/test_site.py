@@ -15,7 +15,6 @@ import epypes_widgets
 from epypes import errors, wire
 from epypes.cli.app import app
 from tests.browser.contrast import schemes, unreadable
-from tests.browser.jupyter import chromium
 from tests.docs.pages import DOCS, ROOT
 
 pytestmark = pytest.mark.slow
@@ -101,12 +100,12 @@ def test_no_page_loads_anything_from_another_machine(site):
 
 
 @pytest.mark.browser
-def test_a_tutorial_is_readable_in_both_themes_and_the_search_finds_the_runner(site):
-    with chromium() as browser:
-        page = browser.new_page()
-        page.goto((site / "tutorials/01_edge_detection.html").as_uri())
-        for scheme in schemes(page):
-            page.wait_for_selector(f'html[data-theme="{scheme}"]', timeout=60_000)
-            assert unreadable(page, ".bd-article") == []
-        page.goto((site / "search.html").as_uri() + "?q=CompGraphRunner")
-        page.wait_for_selector('#search-results a[href*="epypes.CompGraphRunner.html"]', timeout=60_000)
+def test_a_tutorial_is_readable_in_both_themes_and_the_search_finds_the_runner(site, browser):
+    page = browser.new_page()
+    page.goto((site / "tutorials/01_edge_detection.html").as_uri())
+    for scheme in schemes(page):
+        page.wait_for_selector(f'html[data-theme="{scheme}"]', timeout=60_000)
+        assert unreadable(page, ".bd-article") == []
+    page.goto((site / "search.html").as_uri() + "?q=CompGraphRunner")
+    page.wait_for_selector('#search-results a[href*="epypes.CompGraphRunner.html"]', timeout=60_000)
+    page.close()
