@@ -216,3 +216,9 @@ def drawn(figure: Figure) -> Figure:
     """The figure, once it has been laid out without an error."""
     figure.draw_without_rendering()
     return figure
+
+
+def test_a_page_has_the_texts_of_a_figure_as_text(measured):
+    shown = figure_14(measured)._repr_mimebundle_()
+    assert "Figure 14: where the time of each request goes</text>" in shown["image/svg+xml"]
+    assert "Figure 14: where the time of each request goes</text>" in shown["text/html"]

@@ -72,8 +72,7 @@ class ThemedFigure:
 
     def savefig(self, fname: Any, **options: Any) -> None:
         """Save the figure as Matplotlib does, in Matplotlib's own style."""
-        with style.context(PLOT_STYLE):
-            self.figure.savefig(fname, **options)
+        self._save(fname, {}, **options)
 
     @property
     def alt(self) -> str:
@@ -88,9 +87,13 @@ class ThemedFigure:
     def _svg(self) -> str:
         svg = BytesIO()
         # In a file letters are drawn. Here they stay text, which is smaller, and which screen readers read.
-        with style.context([*PLOT_STYLE, {"svg.fonttype": "none"}]):
-            self.figure.savefig(svg, format="svg", metadata={"Date": None})
+        self._save(svg, {"svg.fonttype": "none"}, format="svg", metadata={"Date": None})
         return svg.getvalue().decode()
+
+    def _save(self, fname: Any, settings: dict[str, Any], **options: Any) -> None:
+        with style.context([*PLOT_STYLE, settings]):
+            # A Plot's own savefig comes here, and would set the style again, without these settings.
+            Figure.savefig(self.figure, fname, **options)
 
     def _themed(self, svg: str) -> str:
         for written, themed in _THEMED.items():
@@ -110,8 +113,7 @@ class Plot(Figure):
 
     def savefig(self, fname: Any, **options: Any) -> None:
         """Save the figure as Matplotlib does, in its own style."""
-        with style.context(PLOT_STYLE):
-            super().savefig(fname, **options)
+        ThemedFigure(self).savefig(fname, **options)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
         return ThemedFigure(self)._repr_mimebundle_(include, exclude)
