@@ -300,7 +300,7 @@ def _unpacked(data: bytes, images: Sequence[bytes]) -> list[memoryview]:
         length = int.from_bytes(view[place:start], "little")
         if length & _IS_IMAGE:
             if length ^ _IS_IMAGE >= len(images):
-                raise ValueError("an image of a message is missing")
+                raise InvalidValue("an image of a message is missing")
             frames.append(memoryview(images[length ^ _IS_IMAGE]))
             place = start
             continue

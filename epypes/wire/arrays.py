@@ -38,6 +38,12 @@ ENCODINGS: dict[str, tuple[int, str]] = {
 }
 
 
+def row_bytes(width: int, encoding: str) -> int:
+    """Return how many bytes a row of an image takes without padding."""
+    channels, dtype = ENCODINGS[encoding]
+    return width * channels * int(dtype[-1])
+
+
 def image_encoding(array: AnyArray, order: str = "bgr") -> str | None:
     """Return the image encoding of an array, or None if it is sent as a tensor.
 
@@ -229,7 +235,7 @@ def read_image(reader: ValueReader, message: Any, path: Path) -> AnyArray:
         )
     channels, dtype_text = ENCODINGS[encoding]
     dtype = np.dtype(dtype_text)
-    row = width * channels * dtype.itemsize
+    row = row_bytes(width, encoding)
     if row == 0 or height == 0 or step < row:
         text = f"{format_path(path)} is {width} x {height} {encoding} with step {step}; a row takes {row} bytes."
         raise MessageError("bad step", text)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from epypes.errors import MessageError
 from epypes.optional import optional_import
+from epypes.wire.arrays import row_bytes
 from epypes.wire.decoder import read_header
 from epypes.wire.limits import DEFAULT_LIMITS, LEADING_FRAMES
 from epypes.wire.protobuf import message_class
@@ -17,8 +18,8 @@ from epypes.wire.protobuf import message_class
 if TYPE_CHECKING:
     from google.protobuf.message import Message
 
-# Those of ours that Foxglove shows, with the bytes of a pixel; they have the same names there.
-_RAW_ENCODINGS: Final = {"mono8": 1, "mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}
+# Those of ours that Foxglove shows; they have the same names there.
+_RAW_ENCODINGS: Final = frozenset({"mono8", "mono16", "bgr8", "rgb8", "bgra8", "rgba8"})
 _FILE_STARTS: Final = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
 _SECOND_NS: Final = 10**9
 
@@ -94,7 +95,7 @@ def image_data(schema: str, message: bytes) -> bytes:
 
 
 def _raw_image(content: Any, data: memoryview) -> Any:
-    row = content.width * _RAW_ENCODINGS.get(content.encoding, 0)
+    row = row_bytes(content.width, content.encoding) if content.encoding in _RAW_ENCODINGS else 0
     if not 0 < row <= content.step or content.height * content.step != data.nbytes:
         return None
     fields = {name: getattr(content, name) for name in ("width", "height", "encoding", "step")}

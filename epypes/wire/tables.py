@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.errors import MessageError
+from epypes.errors import MessageError, install_command
 from epypes.wire.limits import Path, format_path
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def _pyarrow(path: Path) -> Any:
     try:
         import pyarrow
     except ImportError as error:
-        text = f"{format_path(path)} is a table, which travels by pyarrow: pip install 'epypes[tables]'."
+        text = f"{format_path(path)} is a table, which travels by pyarrow: {install_command('tables')}."
         raise MessageError("no pyarrow", text) from error
     return pyarrow
 

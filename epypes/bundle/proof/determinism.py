@@ -271,15 +271,17 @@ def _unseeded(usual: ReplayReport) -> Iterator[tuple[str, bool]]:
 
     It is where a cell or another function seeds the generator: in a service, that doesn't decide what is drawn.
     """
-    cells = {home: f"the notebook seeds ({place})" for home, place in seeds_in_notebook().items()}
+    seeded = {home: f"the notebook seeds ({place})" for home, place in seeds_in_notebook().items()}
+    seeded |= {home: f"function {name!r} seeds" for name, seeds in usual.seeds.items() for home in seeds}
     for name, draws in usual.draws.items():
-        functions = {home: f"function {other!r} seeds" for other, seeds in usual.seeds.items() for home in seeds}
         for home, draw in draws.items():
             text = f"Function {name!r} draws by {draw!r} from the random generator of {home}"
             way_out = f"Seed it in {name!r}, or draw from np.random.default_rng(seed)."
-            seeded = {**cells, **functions}.get(home)
-            if seeded:
-                yield f"{text}, which {seeded}; in a service, other events draw from it in between. {way_out}", True
+            if home in seeded:
+                yield (
+                    f"{text}, which {seeded[home]}; in a service, other events draw from it in between. {way_out}",
+                    True,
+                )
             else:
                 yield f"{text}, which nothing seeds: a service draws the same in each event. {way_out}", False
 
