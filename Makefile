@@ -1,6 +1,6 @@
 # Set-up and checks. Everything happens in .venv; nothing else on the machine is changed, except that `make test`
-# installs Chromium, PostgreSQL, RabbitMQ, NATS and mosquitto with apt when they are missing and you are root; no
-# server is started but those of the tests.
+# installs Chromium, PostgreSQL and what .ci/packages names with apt when they are missing and you are root; no server is
+# started but those of the tests.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -18,7 +18,7 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
 
-test: $(VENV)/.test chromium postgres brokers
+test: $(VENV)/.test chromium postgres packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -28,7 +28,7 @@ test: $(VENV)/.test chromium postgres brokers
 
 # The long forms: every combination, long series, and far more examples for what searches at random:
 # a quarter of an hour.
-soak: $(VENV)/.test chromium postgres brokers
+soak: $(VENV)/.test chromium postgres packages
 	EPYPES_SOAK=1 $(PYTEST) -m "soak or fuzz" -o timeout=3600 -o faulthandler_timeout=3000
 
 # The default selection on every other Python that is found, and on the lowest versions that pyproject.toml admits;
@@ -83,10 +83,10 @@ $(VENV)/.bench: pyproject.toml | $(BIN)/python
 	$(PIP) --target $(VENV)/published --no-deps epypes==0.1.1
 	touch $@ $(VENV)/.test $(VENV)/.all
 
-.PHONY: chromium postgres brokers
+.PHONY: chromium postgres packages
 chromium:
 	@sh .ci/chromium
 postgres:
 	@sh .ci/postgres
-brokers:
-	@sh .ci/brokers
+packages:
+	@sh .ci/packages

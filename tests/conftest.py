@@ -66,7 +66,7 @@ def pytest_xdist_make_scheduler(config, log):
 def pytest_collection_modifyitems(items):
     """Where there is no broker, the tutorial on brokers says that in place of the outputs that are saved in it."""
     if not is_installed():
-        reason = "nats is not installed on this machine: sh .ci/brokers"
+        reason = "nats is not installed on this machine: sh .ci/packages"
         for item in items:
             if item.path.name == "09_beyond_one_machine.ipynb":
                 item.add_marker(pytest.mark.skip(reason=reason))

@@ -20,7 +20,7 @@ def running(name, **options):
     """Start a broker for the time of a fixture, or skip where it is not installed."""
     module = importlib.import_module(f"tests.brokers.{name}")
     if not module.is_installed():
-        pytest.skip(f"{name} is not installed on this machine: sh .ci/brokers")
+        pytest.skip(f"{name} is not installed on this machine: sh .ci/packages")
     with module.server(**options) as made:
         yield made
 

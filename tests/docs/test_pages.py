@@ -62,7 +62,7 @@ def test_the_guide_on_installation_has_every_extra():
 def test_the_blocks_of_a_guide_run_from_top_to_bottom(reader, guide, request):
     text = GUIDES[guide].read_text(encoding="utf-8")
     if BROKER in text and not is_installed():
-        pytest.skip("nats is not installed on this machine: sh .ci/brokers")
+        pytest.skip("nats is not installed on this machine: sh .ci/packages")
     if guide == "promote":
         cells = [nbformat.v4.new_code_cell(text) for language, text in blocks(QUICKSTART) if language == "python"]
         nbformat.write(nbformat.v4.new_notebook(cells=cells), "quickstart.ipynb")
