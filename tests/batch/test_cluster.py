@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
-import time
 from dataclasses import replace
 
 import dask
@@ -50,13 +50,6 @@ def client():
         yield made
 
 
-def until(condition, what):
-    deadline = time.monotonic() + _WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline, what
-        threading.Event().wait(0.005)
-
-
 def test_a_client_that_was_closed_raises_with_the_way_out(client, runner, crops):
     with Client(client.scheduler.address) as other:
         executor = other.get_executor()
@@ -84,43 +77,56 @@ def test_a_cluster_reads_files_itself(client, runner, folder):
 
 HELD = """
 import os
-import pathlib
-import threading
+import socket
 
 
-def weigh(image, marks):
+def weigh(image, port):
     level = int(image[0, 0])
-    if marks:
-        is_first = not any(pathlib.Path(marks).iterdir())
-        pathlib.Path(marks, str(os.getpid())).touch()
-        if is_first:
-            # Until this worker is killed.
-            threading.Event().wait(60)
+    if port:
+        with socket.create_connection(("127.0.0.1", port)) as line:
+            line.send(str(os.getpid()).encode())
+            # Until this worker is killed, or may go on.
+            line.recv(1)
     return level * level
 """
 
 
-def test_a_worker_killed_half_way_loses_nothing_and_nothing_comes_twice(client, tmp_path):
+def test_a_worker_killed_half_way_loses_nothing_and_nothing_comes_twice(client):
     made = cell(HELD)
-    cg = ep.CompGraph({"weigh": made["weigh"]}, {"weigh": (("image", "marks"), "weight")})
+    cg = ep.CompGraph({"weigh": made["weigh"]}, {"weigh": (("image", "port"), "weight")})
     runner = ep.CompGraphRunner(cg)
-    images = [{"image": np.full((2, 2), n), "marks": str(tmp_path) if n == 20 else ""} for n in range(40)]
-    killed = []
+    came = []
 
-    def kill():
-        until(lambda: any(tmp_path.iterdir()), "nobody has come to the image at which the worker is killed")
-        killed.extend(int(mark.name) for mark in tmp_path.iterdir())
-        os.kill(killed[0], signal.SIGKILL)
+    def kill_the_first():
+        while True:
+            line, _ = server.accept()
+            with line:
+                process = int(line.recv(20) or 0)
+                if not process:
+                    return
+                came.append(process)
+                if len(came) == 1:
+                    os.kill(process, signal.SIGKILL)
+                else:
+                    line.send(b".")
 
-    killer = threading.Thread(target=kill)
-    killer.start()
-    result = ep.map(runner, images, client.get_executor())
-    killer.join(_WAIT_S)
-    assert killed[0] != os.getpid()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        images = [{"image": np.full((2, 2), n), "port": port if n == 20 else 0} for n in range(40)]
+        killer = threading.Thread(target=kill_the_first)
+        killer.start()
+        try:
+            result = ep.map(runner, images, client.get_executor())
+            expected = ep.map(runner, images)
+        finally:
+            socket.create_connection(("127.0.0.1", port)).close()
+            killer.join(_WAIT_S)
+    killed, second, last = came
+    assert last == os.getpid()
+    assert last not in (killed, second)
+    assert killed != second
     assert [outcome.number for outcome in result] == list(range(40))
     assert [outcome.values["weight"] for outcome in result] == [level * level for level in range(40)]
-    assert len(list(tmp_path.iterdir())) == 2
-    expected = ep.map(runner, images)
     assert without_times(result) == without_times(expected)
 
 

@@ -38,6 +38,10 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "lambda over lines": ("longer = lambda a: [  # odd\n    a.sum(),\n    2]", {"longer": "longer"}),
     "lambda that calls itself": ("halve = lambda a: a if a.max() < 1 else halve(a / 2)", {"halve": "halve"}),
+    "vectorized": (
+        "def halved(v, by):\n    return v // by\nhalve_all = np.vectorize(halved, otypes=[np.int32], excluded={'by'})",
+        {"vectorized": "lambda a: halve_all(a, by=2)"},
+    ),
     "partial": ("clip = functools.partial(np.clip, a_min=1, a_max=4)", {"clip": "clip"}),
     "partial of a partial": (
         "def scale(by, a, offset=0):\n    return a * by + offset\nthrice = functools.partial(scale, 3)",
@@ -236,6 +240,7 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "callable object": ("class C:\n    def __call__(self, a):\n        return a", "C()", r"'C' \(cell \[1\], line 2\)\. Write a plain"),
     "magic": ("def f(a):\n    get_ipython().run_line_magic('time', 'a')\n    return a", "f", r"\(cell \[1\], line 2\), the notebook itself, as magics.* Write it in Python"),
     "display": ("def f(a):\n    display(a)\n    return a", "f", r"'display' \(cell \[1\], line 2\).* Return it as a token"),
+    "objects": ("import gc\ndef f(a):\n    return len(gc.get_objects())", "f", r"uses 'gc\.get_objects' \(cell \[1\], line 3\), by which"),
     "input": ("def f(a):\n    return input()", "f", r"\(cell \[1\], line 2\), which asks a person\. Make the answer a token"),
     "file": ("def f(a):\n    return __file__", "f", r"'__file__' \(cell \[1\], line 2\), which is another one"),
     "global write": ("N = 0\ndef f(a):\n    global N\n    N += 1\n    return N", "f", r"changes the global 'N' \(cell \[1\], line 4\)\. Return"),

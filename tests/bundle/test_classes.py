@@ -46,6 +46,10 @@ PROMOTED = {
         "from typing import NamedTuple\nclass Pt(NamedTuple):\n    x: int\n    y: int = 4\nZERO = Pt(0)\n"
         "def f(x):\n    return ZERO.y + Pt(x).x\n"
     ),
+    "named tuple that is made by a call": (
+        "from collections import namedtuple\nPair = namedtuple('Pair', 'x y', defaults=[4])\nZERO = Pair(0)\n"
+        "def f(x):\n    return ZERO.y + Pair(x).x\n"
+    ),
     "base": (
         "class A:\n    def g(self):\n        return 1\nclass B(A):\n    def g(self):\n        return super().g() + 1\n"
         "def f(x):\n    return B().g() + x\n"
@@ -116,6 +120,10 @@ REFUSED = {
     "made in a function": (
         f"def make():\n    class A:\n        def g(self):\n            return 1\n    return A\nA = make()\n{USED}",
         r"defined inside 'make\.<locals>'\. Define it at the margin",
+    ),
+    "a named tuple with more": (
+        "import collections\nSingle = collections.namedtuple('Single', 'k')\nSingle.g = lambda self: self.k\ndef f(x):\n    return Single(x).g()\n",
+        r"Class 'Single'.* it has 'g' only in the notebook",
     ),
     "made by a call": (f"A = type('A', (), {{'g': lambda self: 1}})\n{USED}", r"was made by a call\. Write a class statement"),
     "writes a global": (

@@ -187,6 +187,14 @@ def test_changed_print_options_of_numpy_are_noted(tmp_path):
     assert any("The notebook has changed numpy.set_printoptions" in note for note in notes)
 
 
+def test_changed_print_options_of_numpy_are_refused_where_a_function_writes_an_array_as_text(tmp_path):
+    names = cell("import numpy as np\ndef use(x):\n    return np.array2string(x) if x.max() > 1e6 else 'small'")
+    runner = ep.CompGraphRunner(ep.CompGraph({"use": names["use"]}, {"use": ("x", "used")}))
+    runner.run(x=X)
+    with np.printoptions(precision=2), pytest.raises(PromotionRefused, match="has changed numpy.set_printoptions"):
+        ep.promote(runner, tmp_path / "bundle")
+
+
 def test_each_number_of_threads_is_varied_from_what_it_is_set_to(tmp_path, monkeypatch):
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
     before = cv2.getNumThreads()

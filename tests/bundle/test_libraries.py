@@ -6,6 +6,7 @@ import calendar
 import contextlib
 import csv
 import decimal
+import logging
 import warnings
 
 import cv2
@@ -143,6 +144,14 @@ def reasons_against_patches(tmp_path_factory):
 def test_a_library_that_the_notebook_has_patched_is_named_with_its_line(how, reasons_against_patches):
     number = [*PATCHES].index(how) + 2
     assert PATCHES[how][2].replace("cell [N]", f"cell [{number}]") in reasons_against_patches
+
+
+def test_an_entry_that_a_cell_registers_in_python_s_library_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(logging, "_levelToName", {**logging._levelToName})
+    monkeypatch.setattr(logging, "_nameToLevel", {**logging._nameToLevel})
+    cell = "import logging\nlogging.addLevelName(30, 'W')"
+    text = refusal(monkeypatch, tmp_path, cell, branch("logging.getLevelName(30)"))
+    assert "logging._levelToName[30] (cell [1], line 2, 'W'); a service has it as it was installed ('WARNING')" in text
 
 
 def test_a_function_that_keeps_something_in_a_library_is_refused(monkeypatch, tmp_path):

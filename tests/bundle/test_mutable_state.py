@@ -319,6 +319,11 @@ def test_a_call_that_patches_a_library_an_enumeration_or_a_logger_fails_and_is_u
         ("np.random.seed(x)", "np.random.default_rng(1).integers(9) + stats.norm(0, 1).rvs()"),
         ("np.random.seed(x)", "[*np.random.default_rng(1).permutation(3), *pd.Series(range(99)).sample(5)]"),
         ("cv2.setRNGSeed(x)", "cv2.randu(np.zeros(3), 0, 9).tolist()"),
+        (
+            "cv2.setRNGSeed(x)",
+            "[m.trainIdx for m in cv2.FlannBasedMatcher({'algorithm': 1}, {'checks': 2}).match(P[:99], P[99:])]",
+        ),
+        ("np.random.seed(x)", "vq.kmeans2(P, 4)[0].tolist()"),
         ("seed(x)", "draw()"),
     ],
 )
@@ -326,8 +331,10 @@ def test_what_an_event_draws_depends_on_no_earlier_one_also_if_it_has_no_seed(se
     source = f"""
 from random import random as draw, seed
 from scipy import stats
+from scipy.cluster import vq
 import cv2
 import pandas as pd
+P = np.random.default_rng(1).random((300, 16), np.float32)
 def g(x):
     if x < 100: {seed}
     return x

@@ -19,6 +19,7 @@ modules and classes that it names where it stores by text, as ``vars`` and ``set
 
 from __future__ import annotations
 
+import ast
 import dis
 import functools
 import sys
@@ -31,7 +32,7 @@ from typing import Any, Final
 
 from epypes.bundle.private_import import import_module, plain_name
 from epypes.bundle.proof.libraries import OF_THE_PROCESS
-from epypes.bundle.proof.process_settings import global_generator
+from epypes.bundle.proof.process_settings import SEED_PARAMETERS, default_generator, global_generator
 from epypes.bundle.source.references import (
     attributes_loaded,
     cells_of,
@@ -42,6 +43,7 @@ from epypes.bundle.source.references import (
     meanings_of,
     nested_codes,
 )
+from epypes.bundle.source.resolve import definition_of
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import WATCH, is_array
 from epypes.run.snapshot import (
@@ -86,8 +88,6 @@ _BINDS_BY_TEXT: Final = frozenset({"setattr", "delattr", "vars", "__dict__", "__
 # Py_TPFLAGS_HEAPTYPE: a class with this flag is no static one of C, which takes no attributes.
 _MADE_BY_PYTHON: Final = 1 << 9
 _SAME_MODULE: Final = {"posix": "os", "nt": "os", "_locale": "locale", "_decimal": "decimal"}
-# By these keywords a method of SciPy or pandas is given a generator or a seed.
-_GIVEN_ONE: Final = frozenset({"random_state", "rng"})
 _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
 
@@ -134,9 +134,10 @@ class CodeSnapshot(Snapshot):
         self.has_code = False
         self.is_unlocking = False
         self._locked: list[tuple[str, Any]] = []
-        # The names of the user's functions, and of methods of objects that aren't known.
-        self._own_names: set[str] = set()
-        self._methods: dict[str, str] = {}
+        # The user's functions; what draws unless it is given a seed or generator, by name, and whether one is given.
+        self._functions: list[types.FunctionType] = []
+        self._draws_by_default: dict[str, str] = {}
+        self._gives_seed = False
         # What is compared or reset if the code has one of the names or instructions.
         self._possible: list[tuple[frozenset[str], Callable[[], object]]] = []
         # The modules, classes and functions of libraries that the code names.
@@ -146,8 +147,10 @@ class CodeSnapshot(Snapshot):
             if needed & self.words:
                 add()
         self._possible.clear()
-        if not _GIVEN_ONE & self.words:
-            self.draws |= {name: home for name, home in self._methods.items() if name not in self._own_names}
+        own = {function.__name__ for function in self._functions}
+        by_default = {name: home for name, home in self._draws_by_default.items() if name not in own}
+        unseeded = self._called_without_seed() if self._gives_seed and by_default else by_default.keys()
+        self.draws |= {name: home for name, home in by_default.items() if name in unseeded}
         self._compare_libraries()
 
     def __bool__(self) -> bool:
@@ -252,7 +255,7 @@ class CodeSnapshot(Snapshot):
             self._of_libraries[id(function)] = f"{function.__name__}.", function
             yield from _wrapped_by(function)
             return
-        self._own_names.add(function.__name__)
+        self._functions.append(function)
         _check_caches(known)
         self._compare(_BINDS, functools.partial(_Bindings, "", known))
         self._compare(_BINDS, functools.partial(_Bindings, f"{function.__name__}.", function))
@@ -280,7 +283,8 @@ class CodeSnapshot(Snapshot):
         """Note the names of some code, also those that are texts, and the instructions by which it binds them."""
         self.has_code = True
         self.words.update(code.co_names, (text for text in code.co_consts if type(text) is str and text.isidentifier()))
-        self.words |= _GIVEN_ONE & {word for part in code.co_consts if type(part) is tuple for word in part}
+        keywords = {word for part in code.co_consts if type(part) is tuple for word in part}
+        self._gives_seed |= not SEED_PARAMETERS.isdisjoint(keywords)
         for instruction in dis.get_instructions(code):
             operation, name = instruction.opname, instruction.argval
             if operation.startswith(("STORE_", "DELETE_")):
@@ -293,7 +297,16 @@ class CodeSnapshot(Snapshot):
         if home and is_seed:
             self.seeds.add(home)
         elif home:
-            (self._methods if function is None else self.draws)[name] = home
+            (self._draws_by_default if function is None else self.draws)[name] = home
+        elif home := default_generator(function):
+            self._draws_by_default[name] = home
+
+    def _called_without_seed(self) -> set[str]:
+        """Return the names by which the user's functions call something without a seed."""
+        nodes = (definition_of(function.__code__)[1] for function in self._functions)
+        calls = (part for node in nodes if node for part in ast.walk(node) if isinstance(part, ast.Call))
+        without = (call for call in calls if {None, *SEED_PARAMETERS}.isdisjoint(each.arg for each in call.keywords))
+        return {getattr(call.func, "attr", getattr(call.func, "id", "")) for call in without}
 
     def _look_at_class(self, kind: type) -> Found:
         if is_own(str(kind.__module__)):

@@ -13,6 +13,7 @@ import ast
 import os
 import re
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,7 +27,7 @@ from epypes.bundle.manifest import REQUIREMENTS, SAMPLES, SETTINGS, code_of, wri
 from epypes.bundle.proof.compare import Difference, add_tolerances
 from epypes.bundle.proof.file_access import named_here
 from epypes.bundle.proof.libraries import attributes_of, changed_attributes
-from epypes.bundle.proof.process_settings import WARNINGS, is_of_texts, library_settings
+from epypes.bundle.proof.process_settings import OPERATING_SYSTEM, WARNINGS, is_of_texts, library_settings
 from epypes.bundle.proof.replay import ReplayReport
 from epypes.bundle.proof.replay_process import REPLAY_TIMEOUT_S, replay_isolated, without_python
 from epypes.bundle.settings import read_settings
@@ -176,11 +177,12 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         }
         places, calls = places_of_change()
         settings = _changed_settings(usual, draft, places, calls)
-        notes = [reason for name, reason in settings.items() if is_of_texts(name)]
-        reasons = [reason for name, reason in settings.items() if not is_of_texts(name)]
+        words = {getattr(node, "attr", getattr(node, "id", "")) for node in ast.walk(ast.parse(code_of(draft)))}
+        notes = [reason for name, reason in settings.items() if is_of_texts(name, words)]
+        reasons = [reason for name, reason in settings.items() if not is_of_texts(name, words)]
         unseeded = [*_unseeded(usual)]
         reasons += [
-            *_changed_libraries(usual, other, draft, places),
+            *_changed_libraries(usual, other, draft, places, calls),
             *(text for text, is_refused in unseeded if is_refused),
         ]
         notes += [text for text, is_refused in unseeded if not is_refused]
@@ -241,7 +243,9 @@ def _changed_settings(
     return found
 
 
-def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path, places: Mapping[str, str]) -> list[str]:
+def _changed_libraries(
+    usual: ReplayReport, other: ReplayReport, bundle: Path, places: Mapping[str, str], calls: Mapping[str, str]
+) -> list[str]:
     """Return what this process has changed in the libraries of a bundle, as sentences."""
     # What two fresh processes have otherwise depends on the process, and is no change.
     fresh = {
@@ -249,7 +253,7 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path, p
         for library, described in usual.libraries.items()
         if (others := other.libraries.get(library, described)) is not None
     }
-    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle), places)
+    changed = changed_attributes(attributes_of(fresh), fresh, code_of(bundle), places, calls.keys())
     # One change is found wherever a library has the object; the shortest of these names is the best known.
     distinct: dict[tuple[str, str, str], str] = {}
     for (library, name), both in sorted(changed.items(), key=lambda item: len(item[0][0])):
@@ -257,7 +261,8 @@ def _changed_libraries(usual: ReplayReport, other: ReplayReport, bundle: Path, p
     found = []
     for (name, value, default), library in distinct.items():
         here, there = (_DIGEST.sub("", text) for text in (value, default or "it is not there"))
-        place = places.get(name.rpartition(".")[2])
+        registering = (calls[one] for one in calls if name.endswith("]") and one in vars(sys.modules[library]))
+        place = places.get(name.rpartition(".")[2]) or next(registering, None)
         here = ", ".join(filter(None, (place, here if here != there else "in its code or defaults")))
         found.append(
             f"The notebook has changed {library}.{name} ({here}); a service has it as it was installed ({there}). "
@@ -282,6 +287,8 @@ def _unseeded(usual: ReplayReport) -> Iterator[tuple[str, bool]]:
                     f"{text}, which {seeded[home]}; in a service, other events draw from it in between. {way_out}",
                     True,
                 )
+            elif home == OPERATING_SYSTEM:
+                yield f"{text}: each answer is another one. Give it a seed.", False
             else:
                 yield f"{text}, which nothing seeds: a service draws the same in each event. {way_out}", False
 

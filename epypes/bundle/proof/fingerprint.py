@@ -23,6 +23,7 @@ from typing import Any, Final
 
 from epypes.bundle.private_import import plain_name
 from epypes.bundle.requirements import bringing
+from epypes.bundle.source.kept_files import READERS
 from epypes.bundle.source.objects import (
     ATOMS,
     CACHED,
@@ -42,12 +43,8 @@ _DIGEST_BYTES: Final = 16
 _OURS: Final = "epypes"
 # Builtins by which code reads what its names don't say.
 _BY_TEXT: Final = frozenset({"eval", "exec", "globals", "__import__"})
-# Names by which code reads files or the environment: of Python, numpy, OpenCV, Pillow, pandas and scikit-image.
-_READERS: Final = frozenset({
-    "VideoCapture", "environ", "environb", "fromfile", "genfromtxt", "getenv", "getenvb", "imread", "imreadmulti",
-    "load", "loadtxt", "memmap", "open", "open_memmap", "read_bytes", "read_csv", "read_parquet", "read_text",
-    "urlopen",
-})  # fmt: skip
+# Names by which code reads files or the environment.
+_READERS: Final = READERS | {"environ", "environb", "getenv", "getenvb", "urlopen"}
 # Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset(
     {"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "pathlib", "uuid"}

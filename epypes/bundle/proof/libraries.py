@@ -17,9 +17,11 @@ import ast
 import functools
 import hashlib
 import inspect
+import re
 import sys
 import types
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from typing import Any, Final
 
 from epypes.bundle.proof.process_settings import OF_NOTEBOOKS
@@ -31,12 +33,15 @@ _ATOMS: Final = (int, float, complex, bool, str, bytes, type(None), type(...))
 # Longer descriptions are digests.
 _MOST_TEXT: Final = 60
 _MOST_ENTRIES: Final = 500
+_BEGIN_AN_ATOM: Final = tuple("'\"-0123456789")
 _MOST_BYTES: Final = 65_536
 # They hold the interpreter's own state, which is another one in each kind of process.
 OF_THE_PROCESS: Final = frozenset({"sys", "warnings", "threading", "signal", "epypes"})
 # A name in modules that pytest has compiled otherwise, as it does with tests and plugins.
 _OF_PYTEST: Final = "@pytest_ar"
 _OWN: Final = ("__main__.", "unittest.mock.")
+# Functions of Python's library that keep an entry, as logging.addLevelName and csv.register_dialect.
+_REGISTERS: Final = re.compile("add|register|unregister|set|install|pickle")
 _ALWAYS: Final = frozenset({"builtins", "numpy"})
 
 
@@ -64,7 +69,7 @@ def attributes_of(modules: Iterable[str]) -> Attributes:
 
 
 def changed_attributes(
-    here: Attributes, there: Attributes, text: str, named_here: Collection[str]
+    here: Attributes, there: Attributes, text: str, named_here: Collection[str], called: AbstractSet[str] = frozenset()
 ) -> dict[tuple[str, str], tuple[str, str]]:
     """Return by module and attribute what differs here from there, as the descriptions of both.
 
@@ -77,11 +82,16 @@ def changed_attributes(
     named_here
         The names that the notebook may have given another value. Private values, and those that are no constants and
         not named by the bundle, are mostly what libraries count and remember: they count if they are among these.
+    called
+        The names of the functions that the notebook has called: some of Python's library register entries in dicts.
     """
     mentioned = _mentioned(text)
     found: dict[tuple[str, str], tuple[str, str]] = {}
     for module, described in here.items():
         others = there.get(module, {})
+        registers = module in sys.stdlib_module_names and any(
+            _REGISTERS.match(one) and one in vars(sys.modules[module]) for one in called
+        )
         for name, value in described.items() if others else ():
             other = others.get(name, "")
             last = name.rpartition(".")[2]
@@ -97,7 +107,11 @@ def changed_attributes(
                 is_changed |= last in named_here and name not in _left_by_loops(module)
                 is_changed &= other != value and (other != "None" or last in named_here)
                 is_changed &= not value.startswith(OF_NOTEBOOKS)
-            if is_changed:
+            # A text or number in a dict of the module: not the members that an enumeration remembers.
+            is_entry = (
+                registers and "[" in name and "." not in name.partition("[")[0] and value.startswith(_BEGIN_AN_ATOM)
+            )
+            if is_changed or (is_entry and value != other):
                 found[module, name] = value, other
     return found
 

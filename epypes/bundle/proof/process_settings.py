@@ -8,6 +8,7 @@ function computes anything else with it. The random generators of the whole proc
 from __future__ import annotations
 
 import copy
+import inspect
 import operator
 import random
 import sys
@@ -20,7 +21,7 @@ from contextlib import suppress
 from contextvars import Context, copy_context
 from typing import Any, Final, NamedTuple
 
-from epypes.run.snapshot import is_global_generator
+from epypes.run.snapshot import is_global_generator, is_own
 
 # Only where a function catches warnings, errors in their place change what it computes.
 WARNINGS: Final = "warnings.simplefilter"
@@ -31,16 +32,25 @@ OF_NOTEBOOKS: Final = ("IPython", "ipykernel", "matplotlib_inline", "debugpy", "
 
 
 # Code with one of these names may draw from a generator of the whole process, unless it makes its own.
-_DRAWS: Final = frozenset({"random", "setRNGSeed", "randu", "randn", "randShuffle", "kmeans"})
+_DRAWS_OF_CV2: Final = frozenset(
+    {"setRNGSeed", "randu", "randn", "randShuffle", "kmeans", "grabCut", "BOWKMeansTrainer", "DescriptorMatcher_create"}
+    | {"FlannBasedMatcher", "FlannBasedMatcher_create", "flann_Index"}
+)
+_DRAWS: Final = _DRAWS_OF_CV2 | {"random"}
 _OWN_GENERATORS: Final = frozenset({"default_rng", "Generator", "RandomState", "Random"})
 # The functions that draw from these generators or seed them, and that are no methods of one; the methods of objects of
 # SciPy and pandas that draw from NumPy's, unless they are given another one.
 _OF_GENERATORS: Final = {
     "numpy.random": frozenset({"seed", "ranf", "sample"}),
-    "cv2": frozenset({"setRNGSeed", "randu", "randn", "randShuffle", "kmeans"}),
+    "cv2": _DRAWS_OF_CV2,
 }
 _METHODS_THAT_DRAW: Final = {"rvs": "scipy", "sample": "pandas"}
 _SEEDS: Final = frozenset({"seed", "setstate", "set_state", "setRNGSeed"})
+# By these parameters functions of libraries take a seed or a generator; without, they draw from NumPy's, or these from
+# one that the operating system seeds.
+SEED_PARAMETERS: Final = frozenset({"random_state", "rng", "seed"})
+OPERATING_SYSTEM: Final = "the operating system"
+_OF_OPERATING_SYSTEM: Final = frozenset({"skimage"})
 
 
 # -- the table of settings -------------------------------------------------------------------------------------------
@@ -93,9 +103,14 @@ def is_setting(name: str) -> bool:
     return name.startswith(CONTEXT_VARIABLE) or any(name == setting.name for setting in SETTINGS)
 
 
-def is_of_texts(setting: str) -> bool:
-    """Whether a setting changes nothing but how values are written as text."""
-    return setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
+# What writes arrays and tables as texts, as these are set.
+_WRITES_TEXTS: Final = frozenset({"array2string", "array_repr", "array_str", "to_string"})
+
+
+def is_of_texts(setting: str, words: AbstractSet[str]) -> bool:
+    """Whether a setting changes nothing but how values are written as text, which code with these names hardly does."""
+    is_text = setting.startswith(("numpy.set_printoptions", "pandas.set_option display."))
+    return is_text and words.isdisjoint(_WRITES_TEXTS)
 
 
 def _filters_text(filters: Any) -> dict[str, str]:
@@ -374,9 +389,23 @@ def global_generator(name: str, function: Any) -> tuple[str, bool]:
     elif is_global_generator(owner):
         home = "random" if isinstance(owner, random.Random) else "numpy.random"
     else:
-        known = (one for one, names in _OF_GENERATORS.items() if name in names)
-        home = next((one for one in known if function is getattr(sys.modules.get(one), name, None)), "")
+        homes = [(sys.modules[one], names) for one, names in _OF_GENERATORS.items() if one in sys.modules]
+        named = ((one.__name__, getattr(one, each, None)) for one, names in homes for each in names)
+        home = next((one for one, known in named if known is function), "")
     return home, name in _SEEDS
+
+
+def default_generator(function: Any) -> str:
+    """Return whose generator a function of a library draws from where it is given no seed; "" if it takes none."""
+    top = str(getattr(function, "__module__", None)).partition(".")[0]
+    if top in ("numpy", "random") or is_own(top):
+        return ""
+    try:
+        parameters = inspect.signature(function).parameters
+    except Exception:  # it is written in C, or whatever an object raises that is asked for its signature
+        return ""
+    takes_seed = any(parameters[name].default is None for name in SEED_PARAMETERS & parameters.keys())
+    return "" if not takes_seed else OPERATING_SYSTEM if top in _OF_OPERATING_SYSTEM else "numpy.random"
 
 
 class GlobalGenerators:

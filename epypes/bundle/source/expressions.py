@@ -155,7 +155,7 @@ _PARTS_OF_DATES: Final = {
 _MOST_NUMBERS: Final = 200
 _MOST_CHARACTERS: Final = 400
 # Objects of these are what their classes make of the arguments; nothing else is done to them.
-_OF_THEIR_ARGUMENTS: Final = ("scipy.interpolate.", "scipy.spatial.", "skimage.transform.")
+_OF_THEIR_ARGUMENTS: Final = ("numpy.vectorize", "scipy.interpolate.", "scipy.spatial.", "skimage.transform.")
 _ARRAY: Final = re.compile(r'array\(.*?"\)')
 
 
@@ -278,7 +278,7 @@ class _Writer:
         """Return the call of its class by which a cell has made an object; "" if that is not all that was done."""
         kind, names = type(value), self.gathered.notebook or vars(sys.modules["__main__"])
         is_own = kind.__module__ == "__main__" and not isinstance(value, Node) and not changes_itself(kind)
-        if not is_own and not kind.__module__.startswith(_OF_THEIR_ARGUMENTS):
+        if not is_own and not f"{kind.__module__}.{kind.__qualname__}".startswith(_OF_THEIR_ARGUMENTS):
             return ""
         given = next(filter(None, (assignment_of(name, names) for name in names_of(value, names))), None)
         call = given[0].value if given is not None else None

@@ -28,8 +28,9 @@ from epypes.bundle.source.expressions import (
     laid_out,
     quoted,
 )
+from epypes.bundle.source.kept_files import check_files
 from epypes.bundle.source.objects import without_nodes
-from epypes.bundle.source.own_modules import OwnModules
+from epypes.bundle.source.own_modules import OwnModules, functions_reached_by
 from epypes.bundle.source.resolve import Refused, parsed
 from epypes.bundle.source.slice import Slice, Written, gather
 from epypes.errors import run_call
@@ -109,12 +110,16 @@ def write_module(
     reserved = {"func_dict", "func_io", *(name for name, is_used in own.items() if is_used)}
     gathered, (references, delays) = gather(write, reserved, stores_arrays=True)
     modules = OwnModules(sorted(gathered.modules))
-    modules.check([*cg.functions.values(), *adapters.values(), *enums.values(), pipeline], gathered.patches)
+    values = [*cg.functions.values(), *adapters.values(), *enums.values(), pipeline]
+    reached = [*functions_reached_by(values)]
+    modules.check(reached, gathered.patches)
     for name in modules.registering:
         with gathered.noted_refusals():
             gathered.import_module(name)
-    if gathered.refusals or modules.refusals:
-        return "", (), list(dict.fromkeys([*gathered.refusals, *modules.refusals]))
+    refusals = list(dict.fromkeys([*gathered.refusals, *modules.refusals]))
+    refusals = refusals or check_files(reached, cg, settings.hyperparameters, settings.inputs)
+    if refusals:
+        return "", (), refusals
     module = emit_module(settings, cg, gathered, references, delays)
     why = refusal(module, functools.partial(_pairs, cg, adapters, pipeline, enums), gathered.arrays, modules)
     return module, (gathered.arrays, modules), [why] if why else []

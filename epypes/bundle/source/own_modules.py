@@ -205,19 +205,19 @@ class OwnModules:
 
     # -- checks ------------------------------------------------------------------------------------------------------
 
-    def check(self, values: Iterable[Any], patches: Patches) -> None:
-        """Check the code that some values reach, and note the refusals.
+    def check(self, reached: Iterable[types.FunctionType], patches: Patches) -> None:
+        """Check the code that the graph reaches, and note the refusals.
 
         Parameters
         ----------
-        values
-            The functions of the graph, and what else the bundle is made of.
+        reached
+            The user's functions that the graph, and what else the bundle is made of, refer to.
         patches
             What the notebook has changed in libraries.
         """
         if not self._modules:
             return
-        functions = sorted(functions_reached_by(values), key=lambda function: function.__code__.co_filename)
+        functions = sorted(reached, key=lambda function: function.__code__.co_filename)
         # What a module has registered, or a package imports only when it is asked for, has a home that no text names.
         homes = {str(function.__globals__.get("__name__")): function.__globals__ for function in functions}
         loaded = {name: loaded_module(name) for name in homes if name != "__main__"}

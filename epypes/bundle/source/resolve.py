@@ -582,6 +582,14 @@ def statements_of_class(kind: type) -> Iterator[tuple[str, ast.ClassDef]]:
         yield from ((file, node) for node in reversed(found) if node.name == kind.__name__)
 
 
+def is_named_tuple(kind: type) -> bool:
+    """Whether a class was made by a call of ``collections.namedtuple``, or of ``typing.NamedTuple``."""
+    if kind.__bases__ != (tuple,) or "_field_defaults" not in vars(kind):
+        return False
+    # A class statement has annotations, and a class without them may have the name of one.
+    return not getattr(kind, "__annotations__", None) or next(statements_of_class(kind), None) is None
+
+
 def functions_of(kind: type) -> dict[str, types.FunctionType]:
     """Return the functions of a class that were written for it, by name; of a property, its first.
 

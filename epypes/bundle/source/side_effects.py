@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import gc
 import inspect
 import os
 import sys
@@ -176,7 +177,10 @@ def check_notebook_name(name: str, found: Definition) -> None:
 
 
 # By these a function reaches what no name in it says: a namespace, or whatever a text evaluates to.
-_REFLECTING: Final = (builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack)
+_REFLECTING: Final = (
+    *(builtins.eval, builtins.exec, sys.modules, sys._getframe, inspect.currentframe, inspect.stack),
+    *(gc.get_objects, gc.get_referents, gc.get_referrers),
+)
 _REFLECTING_ATTRIBUTES: Final = frozenset(
     {"__globals__", "__builtins__", "f_globals", "f_locals", "f_builtins", "f_back"}
 )

@@ -55,6 +55,7 @@ from epypes.bundle.source.resolve import (
     function_definition,
     importable,
     imports_in,
+    is_named_tuple,
     names_of,
     noted_refusals,
     with_defaults,
@@ -256,6 +257,14 @@ class Slice:
         home = importable(kind)
         if home is not None:
             return self.reference(home, what)
+        if id(kind) not in self._known and is_named_tuple(kind):
+            self.claim(kind.__name__, _of_object(kind), what)
+            self._known[id(kind)] = kind.__name__
+            parts: Any = kind
+            fields, values = literal_source([*parts._fields]), [*parts._field_defaults.values()]
+            defaults = f", defaults={expression(self, values, what)}" if values else ""
+            made = f"{self.module_name('collections', what)}.namedtuple({quoted(kind.__name__)}, {fields}{defaults})"
+            self.define(kind.__name__, "\n".join(laid_out(made, before=f"{kind.__name__} = ")))
         if id(kind) not in self._known:
             found = class_definition(kind, self.notebook or vars(sys.modules["__main__"]), what)
             check_state(found)

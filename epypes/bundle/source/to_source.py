@@ -187,7 +187,7 @@ def _difference(text: str, module: _Module) -> str:
     whats, values, sources = zip(*module.compared, strict=True) if module.compared else ((), (), ())
     # The modules of a bundle can be imported by its own code alone.
     modules = OwnModules(name for name in sorted(module.gathered.modules) if plain_name(name) != name)
-    modules.check(values, module.gathered.patches)
+    modules.check(functions_reached_by(values), module.gathered.patches)
     whole = f"{text}references = [{', '.join(sources)}]\n"
     return refusal(whole, lambda made: zip(whats, values, made.references, strict=True), modules)
 
