@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
 from epypes.acquisition.cameras import Camera, camera, has_twins
-from epypes.acquisition.frames import Frame, Ring, frame_image
+from epypes.acquisition.frames import Frame, Ring, next_frame
 from epypes.errors import CameraUnavailable, InvalidValue, StillRunning
 
-State = Literal["stopped", "running", "ended", "failed"]
+State = Literal["stopped", "running", "unavailable", "ended", "failed"]
 
 # A camera that gives nothing is asked again after 10, 20, 40 ms ..., at last every second.
 _FIRST_RETRY_S: Final = 0.01
 _LAST_RETRY_S: Final = 1.0
-# One missed frame is not reported; this many in a row are.
+# One missed frame is not reported, unless the camera is gone; this many in a row are.
 _MISSES_REPORTED: Final = 5
 # close() may come in the moment before a read begins, which opens the camera again; so it is repeated.
 _CLOSE_AGAIN_S: Final = 0.05
@@ -65,8 +65,12 @@ class ImageAcquisition:
         How far from the time asked for, in seconds, a frame may be: a camera that has died must not answer with an old
         picture.
     on_error
-        Called with a camera's index and an exception: when it has failed and ended, and once per outage when it gave
-        no frame five times in a row, while it is tried again. On the camera's thread; logged without one.
+        Called with a camera's index and an exception: when it has failed and ended, and once per outage when it is
+        unplugged or gave no frame five times in a row, while it is tried again. On the camera's thread; logged without
+        one.
+    on_frame
+        Called with a camera's index and each of its frames, on the camera's thread, which waits for it. What it raises
+        ends the camera.
 
     Raises
     ------
@@ -98,6 +102,7 @@ class ImageAcquisition:
         size: int = 8,
         max_age_s: float = 1.0,
         on_error: Callable[[int, BaseException], object] | None = None,
+        on_frame: Callable[[int, Frame], object] | None = None,
     ) -> None:
         if not cameras:
             raise InvalidValue("Give one camera or more, such as a path, a folder or the number of a device.")
@@ -110,7 +115,8 @@ class ImageAcquisition:
         self._changed = threading.Condition()
         # The workers don't know this object, so that it can be collected while they run, and warn.
         self._workers = tuple(
-            _CameraWorker(index, made, size, on_error, self._changed) for index, made in enumerate(map(camera, cameras))
+            _CameraWorker(index, made, size, on_error, on_frame, self._changed)
+            for index, made in enumerate(map(camera, cameras))
         )
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
@@ -131,8 +137,12 @@ class ImageAcquisition:
 
     @property
     def states(self) -> tuple[State, ...]:
-        """``"stopped"``, ``"running"``, ``"ended"`` (no more frames) or ``"failed"`` (by an exception), by camera."""
-        return tuple(worker.state for worker in self._workers)
+        """The state of each camera.
+
+        ``"stopped"``, ``"running"``, ``"unavailable"`` (unplugged or without frames, and tried again), ``"ended"`` (no
+        more frames) or ``"failed"`` (by an exception).
+        """
+        return tuple("unavailable" if worker.is_away else worker.state for worker in self._workers)
 
     def start(self) -> Self:
         """Start a thread per camera; nothing happens if it runs already.
@@ -216,8 +226,8 @@ class _CameraWorker:
         Is read on the thread.
     size
         Of the ring.
-    on_error
-        Called on the thread with the index and the exception.
+    on_error, on_frame
+        Called on the thread with the index and the exception, or the frame.
     changed
         Notified of the first frame and of the end.
     """
@@ -228,6 +238,7 @@ class _CameraWorker:
         camera: Camera,
         size: int,
         on_error: Callable[[int, BaseException], object] | None,
+        on_frame: Callable[[int, Frame], object] | None,
         changed: threading.Condition,
     ) -> None:
         self.name = f"camera {index}"
@@ -237,14 +248,20 @@ class _CameraWorker:
         # Set by a finalizer, which must not wait for the lock of an Event: the thread that holds it may have called it.
         self.is_abandoned = False
         self._index, self._camera = index, camera
-        self._on_error, self._changed = on_error, changed
+        self._on_error, self._on_frame, self._changed = on_error, on_frame, changed
         self._frames = self._missed = self._failed = self._missed_in_a_row = 0
+        # Whether an outage was reported that lasts.
+        self._is_reported = False
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
     @property
     def counts(self) -> Counts:
         return Counts(self._frames, self._missed, self._failed)
+
+    @property
+    def is_away(self) -> bool:
+        return self._is_reported and self.state == "running"
 
     @property
     def is_settled(self) -> bool:
@@ -257,7 +274,7 @@ class _CameraWorker:
     def start(self) -> None:
         """Start the thread, of which there must be none."""
         self._stop.clear()
-        self.has_frame, self.state, self._missed_in_a_row = False, "running", 0
+        self.has_frame, self.state, self._missed_in_a_row, self._is_reported = False, "running", 0, False
         self._thread = threading.Thread(target=self._run, name=f"epypes {self.name}", daemon=True)
         self._thread.start()
 
@@ -305,18 +322,18 @@ class _CameraWorker:
         """Read frames until the camera is stopped, or has no more."""
         while not self._is_stopping():
             try:
-                given = [self._camera.read()]
+                frame = next_frame(self._camera, self._frames + 1)
             except CameraUnavailable as error:
                 self._stop.wait(self._miss(error))
                 continue
-            captured_ns = time.time_ns()
-            if given[0] is None:
+            if frame is None:
                 return
-            self._missed_in_a_row = 0
-            frame = Frame(frame_image(given), captured_ns, self._frames + 1)
+            self._missed_in_a_row, self._is_reported = 0, False
             # Counted before, so that a caller that has a frame finds it counted.
             self._frames += 1
             self.ring.append(frame)
+            if self._on_frame is not None:
+                self._on_frame(self._index, frame)
             if not self.has_frame:
                 self.has_frame = True
                 self._notify()
@@ -329,7 +346,8 @@ class _CameraWorker:
         """Count a read that gave no frame; return after how many seconds to try again."""
         self._missed += 1
         self._missed_in_a_row += 1
-        if self._missed_in_a_row == _MISSES_REPORTED:
+        if not self._is_reported and (error.is_gone or self._missed_in_a_row >= _MISSES_REPORTED):
+            self._is_reported = True
             self._report(error)
         return float(min(_LAST_RETRY_S, _FIRST_RETRY_S * 2 ** min(self._missed_in_a_row - 1, 10)))
 

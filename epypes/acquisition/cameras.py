@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from numbers import Integral, Real
@@ -13,8 +12,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Protocol, TypeVar, cast, runtime_checkable
 
+from epypes.acquisition.device import BACKENDS, DeviceCamera
 from epypes.acquisition.files import image_files, is_image_file, quiet_opencv, read_image
-from epypes.acquisition.frames import Frame, frame_image
+from epypes.acquisition.frames import Frame, frame_image, frame_of, frames_read, next_due_s
 from epypes.acquisition.video import Video
 from epypes.errors import CameraUnavailable, ImageFileError, InvalidType, InvalidValue
 from epypes.optional import optional_import
@@ -71,6 +71,9 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
           `epypes.video` returns;
         - an array (y, x) or (y, x, channels): a copy of it again and again;
         - the number of a device, or the URL of a stream;
+        - the address of a camera with a node map, as ``epypes cameras`` lists them: ``"basler:SERIAL"`` by pylon,
+          ``"genicam:SERIAL"`` for any of GigE Vision or USB3 Vision. It has ``settings``, ``trigger()`` and ``counts``:
+          see `DeviceCamera`;
         - an opened ``cv2.VideoCapture``, which is yours to release, or a function that returns one, which is called
           again when the device has failed: so you can set what you like on it;
         - an iterable of arrays, an iterator or a generator, or a function that returns one;
@@ -88,6 +91,8 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
         A file or folder can't be read.
     CameraUnavailable
         A device or stream can't be opened.
+    MissingPackage
+        The library of such a camera is not installed.
     TypeError, ValueError
         The source, or ``fps``, can't be one.
 
@@ -102,6 +107,8 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
     """
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, Real) or not fps > 0):
         raise InvalidValue(f"fps must be a number above 0, or None for the source's own pace, not {fps!r:.40}.")
+    if isinstance(source, str) and source.startswith(tuple(f"{kind}:" for kind in BACKENDS)):
+        return DeviceCamera(source, fps)
     if isinstance(source, str) and "://" in source:
         return _of_capture(source, fps, loop)
     if isinstance(source, str | Path):
@@ -187,7 +194,7 @@ def _of_path(path: Path, fps: float | None, loop: bool) -> IterableCamera:
     except OSError as error:  # of a name that is too long
         text = f"Image '{path!s:.80}' can't be read: {error.strerror}. Check the path."
         raise ImageFileError(str(path), text) from error
-    if is_device:
+    if is_device or (path.parts[:2] == ("/", "dev") and not path.exists()):
         return _of_capture(str(path), fps, loop)
     if is_folder:
         files = image_files(path)
@@ -195,6 +202,10 @@ def _of_path(path: Path, fps: float | None, loop: bool) -> IterableCamera:
             text = f"There are no images in folder {str(path)!r}. Put PNG, JPEG or TIFF into it."
             raise ImageFileError(str(path), text)
         return paced(SequenceCamera(lambda: map(read_image, files), loop), fps, USUAL_FPS)
+    if not path.exists() and not path.suffix:
+        text = f"There is no file or folder {str(path)!r}, and no such camera. Write "
+        text += f"{', '.join(f'{kind}:SERIAL' for kind in BACKENDS)}, /dev/video0, or the URL of a stream; "
+        raise ImageFileError(str(path), f"{text}`epypes cameras` lists what is there.")
     if not path.is_file() or is_image_file(path):
         return _still_camera(read_image(path), fps, loop)
     video = Video(path)
@@ -271,7 +282,7 @@ class SequenceCamera:
     def __iter__(self) -> Iterator[Frame]:
         """Yield the frames of one round."""
         for number, item in enumerate(self._start()):
-            yield item if isinstance(item, Frame) else _frame([_image(item)], number)
+            yield item if isinstance(item, Frame) else frame_of([_image(item)], number)
 
     def close(self) -> None:
         """Begin anew with the next `read`; an iterator, which can't, goes on where it was."""
@@ -282,12 +293,6 @@ def _image(item: Any) -> Any:
     if item is None:
         raise InvalidType("The iterator gave None, which is no image. Let it end, or wait inside it for the next one.")
     return item.image if isinstance(item, Frame) else item
-
-
-def _frame(given: list[Any], number: int) -> Frame:
-    """Return what a camera gave, which comes in a list of one, as a frame."""
-    captured_ns = time.time_ns()
-    return Frame(frame_image(given), captured_ns, number)
 
 
 # -- frames per second ------------------------------------------------------------------------------------------------
@@ -324,7 +329,7 @@ class PacedCamera:
         self._closing.clear()
         due_s = -math.inf
         # A user's own camera may have no loop.
-        for frame in self._camera if isinstance(self._camera, Iterable) else _frames_read(self._camera):
+        for frame in self._camera if isinstance(self._camera, Iterable) else frames_read(self._camera):
             if self._is_asked and self._closing.wait(min(due_s - monotonic(), threading.TIMEOUT_MAX)):
                 return
             due_s = next_due_s(due_s, self._period_s)
@@ -345,22 +350,6 @@ def paced(camera: Camera, fps: float | None, usual_fps: float = math.inf) -> Ite
     if kept_fps == math.inf:
         return cast(IterableCamera, camera)
     return PacedCamera(camera, kept_fps, is_asked=fps is not None)
-
-
-def _frames_read(camera: Camera) -> Iterator[Frame]:
-    number = 0
-    while True:
-        given = [camera.read()]
-        if given[0] is None:
-            return
-        yield _frame(given, number)
-        number += 1
-
-
-def next_due_s(due_s: float, period_s: float) -> float:
-    """Return when the frame after one that was due at ``due_s`` is due; a period from now, if that has passed."""
-    now_s = monotonic()
-    return due_s + period_s if now_s - due_s < period_s else now_s + period_s
 
 
 # -- on OpenCV's VideoCapture -----------------------------------------------------------------------------------------
@@ -415,7 +404,7 @@ class LiveCamera:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames without end, until `close` is called; CameraUnavailable if the camera gives none."""
-        return _frames_read(self)
+        return frames_read(self)
 
     def _next(self, capture: Any) -> Any:
         while capture.grab() and not self._is_closed:

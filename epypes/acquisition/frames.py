@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 import threading
+import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from sys import getrefcount
+from time import monotonic
 from typing import Any, Final
 
 from epypes.errors import FrameUnavailable, InvalidType, InvalidValue
@@ -29,16 +33,24 @@ class Frame:
     captured_ns
         When the camera gave it, Unix time in ns.
     number
-        Its place in the camera's stream: from 1 in an ImageAcquisition, from 0 in a video and in a ``for`` over a
-        camera.
+        Its place in the camera's stream: from 1 in an ImageAcquisition and of ``read_frame``, from 0 in a video and in
+        a ``for`` over a camera.
     time_s
         Of a video, its time since the first frame, in s; None of what has no times.
+    frame_id
+        The number that a camera with a node map gave it; frames that are missing or were left out make a gap. Else
+        None.
+    ticks
+        The time of such a camera's own clock, of which ``camera.tick_hz`` are a second: the difference between two
+        frames is exact, and nothing relates it to ``captured_ns``. None if the camera does not say.
     """
 
     image: Array
     captured_ns: int
     number: int
     time_s: float | None = None
+    frame_id: int | None = None
+    ticks: int | None = None
 
     def __repr__(self) -> str:
         shape = getattr(self.image, "shape", "?")
@@ -165,6 +177,44 @@ def frame_image(given: list[Any]) -> Array:
     image = image if is_new else np.array(image, order="K")
     image.setflags(write=False)
     return image
+
+
+def frame_of(given: list[Any], number: int) -> Frame:
+    """Return what a camera gave just now, which comes in a list of one, as a frame."""
+    captured_ns = time.time_ns()
+    return Frame(frame_image(given), captured_ns, number)
+
+
+class FrameCamera(ABC):
+    """A camera that knows more of a frame than its image."""
+
+    @abstractmethod
+    def read_frame(self) -> Frame | None:
+        """Return the next frame; None if there are no more."""
+
+
+def next_frame(camera: Any, number: int) -> Frame | None:
+    """Return the next frame of a camera, with this number in its stream; None if there are no more."""
+    if isinstance(camera, FrameCamera):
+        found = camera.read_frame()
+        return None if found is None else replace(found, number=number)
+    given = [camera.read()]
+    return None if given[0] is None else frame_of(given, number)
+
+
+def frames_read(camera: Any) -> Iterator[Frame]:
+    """Yield the frames of a camera until there are no more."""
+    for number in itertools.count():
+        frame = next_frame(camera, number)
+        if frame is None:
+            return
+        yield frame
+
+
+def next_due_s(due_s: float, period_s: float) -> float:
+    """Return when the frame after one that was due at ``due_s`` is due; a period from now, if that has passed."""
+    now_s = monotonic()
+    return due_s + period_s if now_s - due_s < period_s else now_s + period_s
 
 
 def _references(given: list[Any]) -> int:

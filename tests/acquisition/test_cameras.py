@@ -113,6 +113,17 @@ def test_a_broken_image_in_a_folder_is_named_when_its_turn_comes(tmp_path, capfd
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("address", ["basler", "Basler:1", "gige:123"])
+def test_what_is_neither_a_file_nor_an_address_lists_the_addresses(address):
+    with pytest.raises(ImageFileError, match="no such camera. Write basler:SERIAL, genicam:SERIAL, .*`epypes cameras`"):
+        ep.camera(address)
+
+
+def test_a_video_device_that_is_not_there_is_no_missing_image():
+    with pytest.raises(CameraUnavailable, match="/dev/video4711 can't be opened"):
+        ep.camera("/dev/video4711")
+
+
 def test_an_image_that_vanishes_is_named_when_its_turn_comes(tmp_path):
     for number in (1, 2):
         write_image(tmp_path / f"{number}.png", gray(number))

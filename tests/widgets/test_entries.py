@@ -20,7 +20,7 @@ def screen(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
 def test_undo_before_the_hand_lets_go_adds_an_entry_with_its_picture(panel: Panel, screen: FrontEnd) -> None:
     screen.tell("hold", names=["threshold"])
     screen.tell("move", places={}, values={"threshold": 60})
-    screen.wait_for_values(10, threshold=60)
+    screen.wait_for_values(60, threshold=60)
     screen.tell("undo")
     panel.wait(60)
     assert [entry.values["threshold"] for entry in panel._history.entries] == [100, 60]

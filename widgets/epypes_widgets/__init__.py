@@ -21,8 +21,8 @@ or, for one function, ``interact(edges, image, lo=(0, 255))``. ``panel`` has the
 
 What a hyperparameter may be: ``ranges``, ``tooltips``, ``values``. What is remembered: ``history`` and
 ``history_table``, ``settings`` (TOML files), ``code`` (the line that does the same), ``static`` (the picture in a saved
-notebook). What buttons start: ``search``, ``promotion``. Test images: ``images``, ``cases``. ``picking`` chooses one
-setting of a sweep.
+notebook). What buttons start: ``search``, ``promotion``. Test images: ``images``, ``cases``; in their place a camera:
+``feed``. ``picking`` chooses one setting of a sweep.
 """
 
 from __future__ import annotations

@@ -45,7 +45,13 @@ def are_functions(given: object) -> bool:
 
 
 def made_runner(
-    functions: Any, payload: Sequence[Any], given: Mapping[str, Any], call: str, *, has_images: bool = False
+    functions: Any,
+    payload: Sequence[Any],
+    given: Mapping[str, Any],
+    call: str,
+    *,
+    has_images: bool = False,
+    has_camera: bool = False,
 ) -> Made:
     """Return a runner of functions, run on its payload.
 
@@ -63,6 +69,8 @@ def made_runner(
     has_images
         Whether images are given besides. Then nothing is run, tokens may be left for them, and arrays are
         hyperparameters.
+    has_camera
+        Whether these images are a camera's, whose settings are something to tune.
 
     Raises
     ------
@@ -104,7 +112,7 @@ def made_runner(
         if missing:
             text = f"No value is given for {listed(list(map(repr, missing)))} {of}. Call"
             raise PayloadError(missing, f"{text} {_call(call, cg, tokens, [*values] or missing[:1], missing)}.")
-    if not runner.hyperparameters:
+    if not runner.hyperparameters and not has_camera:
         text = f"There is nothing to tune: no parameter {of} is left for a control. Give one a default, as in"
         raise InvalidValue(f"{text} def f(image, threshold=100).")
     if has_images:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ipywidgets
 
 from epypes.batch.check import CheckResult, Checks
-from epypes.errors import InvalidType, NotComputed, PayloadError, ServiceError, run_call
+from epypes.errors import InvalidType, InvalidValue, NotComputed, PayloadError, ServiceError, run_call
 from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
 from epypes.store import Store
@@ -18,6 +18,7 @@ from epypes_widgets import code, settings
 from epypes_widgets.cases import Cases, read_cases
 from epypes_widgets.controls.column import column
 from epypes_widgets.controls.control import ControlSet, controls
+from epypes_widgets.feed import SETTINGS, CameraFeed
 from epypes_widgets.functions import Made, are_functions, made_runner
 from epypes_widgets.history import StoredHistory, history_of
 from epypes_widgets.messages import Messages
@@ -30,7 +31,7 @@ from epypes_widgets.promotion import proposal
 from epypes_widgets.search import Search
 from epypes_widgets.session import Session, tunable
 from epypes_widgets.tuning import Tuning
-from epypes_widgets.values import json_values, setting_text
+from epypes_widgets.values import differing, json_values, setting_text
 from epypes_widgets.view import Latency, PictureView, use_subshell
 from epypes_widgets.worker import Worker
 
@@ -154,12 +155,20 @@ class Panel(Displayed):
         self._tuning.want(self._tuning.first_values(names), is_return=True)
 
     def code(self) -> str:
-        """Return the line that leads from the runner's first hyperparameters to those of the panel."""
-        first, runner = self._runner.first_hyperparameters, self._runner
-        values = {**first, **self.values}
+        """Return the line that leads from the runner's first hyperparameters to those of the panel.
+
+        Of a camera whose settings were changed, another one before it.
+        """
+        first, runner, feed = self._runner.first_hyperparameters, self._runner, self._session.feed
+        values = {name: value for name, value in {**first, **self.values}.items() if name in first}
         if isinstance(runner, CompGraphRunner):
             default = f"{code.name_of(self, default='panel')}.runner" if self._is_made else "runner"
-            return code.line(code.name_of(runner, default=default), first, values, self._controls.params)
+            text = code.line(code.name_of(runner, default=default), first, values, self._controls.params)
+            if feed is None or feed.values == feed.first:
+                return text
+            camera = code.name_of(feed.camera, default="camera")
+            settings_text = code.line(camera, feed.first, feed.values, verb="settings.set")
+            return f"{settings_text}\n{text}" if differing(first, values) else settings_text
         name = code.name_of(runner.connection, default="service")
         return code.line(name, first, values, self._controls.params, verb="set")
 
@@ -317,7 +326,7 @@ class Panel(Displayed):
         ValueError
             A value is outside of its range.
         """
-        loaded, cg = settings.load(path, {**self._runner.hyperparameters, **self.values}), self._runner.cg
+        loaded, cg = settings.load(path, {**self._session.hyperparameters, **self.values}), self._runner.cg
         self.set(**loaded.values)
         for token, each in loaded.pictures.items():
             if all(map(cg.has_token, filter(None, (token, each.over)))):
@@ -374,6 +383,8 @@ class Panel(Displayed):
             if self.search is not None:
                 self.search.stop()
                 last.callback(self.search.close, timeout_s)
+            if self._session.feed is not None:
+                last.callback(self._session.feed.close, timeout_s)
             last.callback(self._tuning.close, timeout_s)
             last.callback(self._cases.close, timeout_s)
 
@@ -490,6 +501,7 @@ def tune(
     /,
     *,
     images: Iterable[Any] | str | Path | None = None,
+    camera: Any = None,
     cases: Any = None,
     token: str | None = None,
     metric: Any = None,
@@ -513,6 +525,11 @@ def tune(
         asked for. A service has none. Of a graph with state (``ep.delay``) they are the frames of a sequence, with a
         slider too: each is shown with the state that runs over all frames before it leave, from the initial state, with
         the same hyperparameters. What the delayed tokens do not need is not run on those.
+    camera
+        A camera, or what ``ep.camera`` takes, in the place of ``images``: the panel shows its newest frame, computed
+        and painted as fast as it can be, and never an older one. The settings of a camera with a node map (exposure,
+        gain, trigger, pixel format, frame rate, region) have controls, too; hints may give them narrower ranges. The
+        panel has the camera until ``close``.
     cases
         A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
         shows whether it passes with the values that were committed last. A service has none.
@@ -555,6 +572,8 @@ def tune(
         There are images and cases; a hint can't be read, or the hyperparameter's value lies outside of it.
     ServiceError
         The service is gone.
+    CameraUnavailable
+        The camera can't be opened, or gives no frame within ten seconds.
     StoreError
         There can be no such database. One that is away for now is reported in the panel's log.
 
@@ -571,8 +590,11 @@ def tune(
     >>> panel.code()
     'runner.rerun(y=5)'
     """
+    # Those of a camera's settings.
+    own: dict[str, Any] = {name: hints.pop(name) for name in SETTINGS if camera is not None and name in hints}
     if are_functions(tuned):
-        tuned = made_runner(tuned, (), hints, "tune", has_images=images is not None or cases is not None)
+        has_images = not (images is None and cases is None and camera is None)
+        tuned = made_runner(tuned, (), hints, "tune", has_images=has_images, has_camera=camera is not None)
     runner, hints = (tuned.runner, tuned.hints) if isinstance(tuned, Made) else (tunable(tuned), hints)
     if token is not None:
         runner.cg.require_token(token)
@@ -583,17 +605,23 @@ def tune(
         given = payloads(runner, [case.inputs for case, _ in found], [case.name or "" for case, _ in found])
     else:
         given = Payloads() if images is None else payloads(runner, images)
-    session = Session(runner, given)
-    if session.is_service and len(given):
-        runner.trial({}, payload=given[0].values)  # refuses it
-    elif runner.last is None and not len(given) and not session.is_service:
-        free = runner.free_source_tokens
-        text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
-        raise PayloadError(free, text)
-    control_set = ControlSet(controls(runner, hints))
-    looked_at: Any = [case for case, _ in found] or (given.inputs if len(given) else None)
-    if looked_at is not None and session.states is not None:
-        looked_at = [looked_at]  # the frames of one case
-    search = None if metric is None else Search(runner, metric, direction, looked_at, control_set.params)
-    session.begin()
-    return Panel(control_set, session, token, found, store, name, search, isinstance(tuned, Made))
+    if camera is not None and (images is not None or cases is not None):
+        raise InvalidValue("A camera takes the place of images and cases. Give one of them.")
+    with ExitStack() as undone:
+        feed = None if camera is None else undone.enter_context(closing(CameraFeed(runner, camera, own)))
+        session = Session(runner, given, feed)
+        if session.is_service and len(given):
+            runner.trial({}, payload=given[0].values)  # refuses it
+        elif runner.last is None and not len(given) and not session.is_service and feed is None:
+            free = runner.free_source_tokens
+            text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
+            raise PayloadError(free, text)
+        control_set = ControlSet(controls(runner, hints, {} if feed is None else feed.controlled))
+        looked_at: Any = [case for case, _ in found] or (given.inputs if len(given) else None)
+        if looked_at is not None and session.states is not None:
+            looked_at = [looked_at]  # the frames of one case
+        search = None if metric is None else Search(runner, metric, direction, looked_at, control_set.params)
+        session.begin()
+        panel = Panel(control_set, session, token, found, store, name, search, isinstance(tuned, Made))
+        undone.pop_all()
+    return panel

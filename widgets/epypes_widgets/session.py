@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from epypes.errors import InvalidType
 from epypes.run import CompGraphRunner, Run
+from epypes_widgets.feed import CameraFeed
 from epypes_widgets.picture.frame_states import FrameStates
 from epypes_widgets.picture.images import Payloads, is_alike
 
@@ -54,6 +55,8 @@ class Session:
         Its hyperparameters and its last run change when a run has completed.
     payloads
         That may be chosen among.
+    feed
+        The camera whose frames are the payload; its settings are values that may be wanted, too.
 
     Attributes
     ----------
@@ -68,8 +71,8 @@ class Session:
         overwritten unseen, and values are written back.
     """
 
-    def __init__(self, runner: Tunable, payloads: Payloads) -> None:
-        self.runner, self.payloads = runner, payloads
+    def __init__(self, runner: Tunable, payloads: Payloads, feed: CameraFeed | None = None) -> None:
+        self.runner, self.payloads, self.feed = runner, payloads, feed
         self.is_service = not isinstance(runner, CompGraphRunner)
         self.result: Run | None = None
         self.foreign_payloads = 0
@@ -83,8 +86,9 @@ class Session:
         self._lock = threading.Lock()
         self._is_closed = False
         self._wanted: dict[str, Any] = {}
+        self._refused: list[str] = []
         self._image_wanted: int | None = None
-        self._seen = dict(runner.hyperparameters)
+        self._seen = dict(self.hyperparameters)
         if isinstance(runner, CompGraphRunner) and runner.state and len(payloads):
             self.states = FrameStates(runner, self.payloads)
             # Cells may have run this frame with another state.
@@ -92,15 +96,27 @@ class Session:
 
     def begin(self) -> None:
         """Have the first payload run if nothing has been; what a function raises on it is raised."""
-        if self.runner.last is not None or not len(self.payloads):
+        if self.feed is None and (self.runner.last is not None or not len(self.payloads)):
             return
-        run = self.runner.trial({}, payload=self.payloads[0].values)
+        run = self.runner.trial({}, payload=self.payloads[0].values if self.feed is None else self.feed.payload())
         self.runner.adopt(run)
         if run.failure is not None:
             raise run.failure.exception
-        self.image = 0
+        self.image = 0 if self.feed is None else None
 
     # -- from any thread ----------------------------------------------------------------------------------------
+
+    @property
+    def hyperparameters(self) -> dict[str, Any]:
+        """The hyperparameters of the runner, and the settings of the camera."""
+        settings = {} if self.feed is None else self.feed.values
+        return {**settings, **self.runner.hyperparameters}
+
+    @property
+    def first_hyperparameters(self) -> dict[str, Any]:
+        """The same as they were at first."""
+        settings = {} if self.feed is None else self.feed.first
+        return {**settings, **self.runner.first_hyperparameters}
 
     @property
     def wanted(self) -> dict[str, Any]:
@@ -126,7 +142,9 @@ class Session:
 
     @property
     def notice(self) -> str:
-        """What is wrong with the place where the functions run; empty if nothing is."""
+        """What is wrong with the camera, or with the place where the functions run; empty if nothing is."""
+        if self.feed is not None:
+            return self.feed.notice
         return "" if isinstance(self.runner, CompGraphRunner) else self.runner.notice
 
     def want(self, values: Mapping[str, Any]) -> None:
@@ -134,7 +152,7 @@ class Session:
 
         What others have set on a service at the same time is not overwritten: see ``changes_of_others``.
         """
-        now = self.runner.hyperparameters
+        now = self.hyperparameters
         with self._lock:
             self._wanted.update(values)
             if not self.is_service:
@@ -159,7 +177,9 @@ class Session:
         """
         if not isinstance(self.runner, CompGraphRunner):
             self.runner.catch_up()
-        now = dict(self.runner.hyperparameters)
+        if self.feed is not None:
+            self.feed.read_again()
+        now = self.hyperparameters
         with self._lock:
             changed = {name: value for name, value in now.items() if self._seen.get(name, self) is not value}
             self._seen = now
@@ -201,6 +221,8 @@ class Session:
         Superseded
             Something newer is wanted.
         """
+        if is_wanted:
+            self._write_settings()
         with self._lock:
             wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
         last = self.runner.last
@@ -215,6 +237,8 @@ class Session:
             run = self.states.trial(begun[0], wanted, *needed, is_superseded=is_superseded, report=report)
         else:
             payload = self.payloads[image].values if image is not None and begun is None else None
+            if self.feed is not None:
+                payload = self.feed.payload()
             run = self.runner.trial(wanted, *targets, payload=payload)
         if run.failure is not None or self._is_closed:
             return run, True
@@ -237,6 +261,24 @@ class Session:
                 self._image_wanted = None
         self._begun, self._followed = begun, run if is_new else last
         return run, True
+
+    def refusals(self) -> list[str]:
+        """Return what the camera has refused since the last call, a sentence each."""
+        refused, self._refused = self._refused, []
+        return refused
+
+    def _write_settings(self) -> None:
+        """Set what is wanted of the camera; what it refuses is wanted no more."""
+        if self.feed is None:
+            return
+        with self._lock:
+            wanted = {name: value for name, value in self._wanted.items() if name in self.feed.values}
+        self._refused += self.feed.write(wanted) if wanted else []
+        with self._lock:
+            for name, value in wanted.items():
+                if self._wanted.get(name, self) is value:
+                    del self._wanted[name]
+                self._seen[name] = value
 
     def insist(self) -> None:
         """Set what is wanted on a runner that is changed all the time; its next run has it."""

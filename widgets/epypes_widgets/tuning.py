@@ -73,6 +73,8 @@ class Tuning:
         self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
         for control in controls.controls:
             control.on_change(self._moved)
+        if session.feed is not None:
+            session.feed.follow(self._frame_arrived)
 
     def begin(self) -> None:
         """Show what the runner has, if that is up to date; else have it computed."""
@@ -100,7 +102,7 @@ class Tuning:
                 self.controls.release()
                 run = self.session.result
                 if run is not None:
-                    self.screen.log(*self.controls.follow(run.hyperparameters))
+                    self.screen.log(*self.controls.follow(self.values_of(run)))
                     self.screen.show(run, 0)
                 self.screen.close(_CLOSED)
                 self._settled()
@@ -119,7 +121,7 @@ class Tuning:
 
     def first_values(self, names: Sequence[str] = ()) -> dict[str, Any]:
         """Return the values that the runner had hyperparameters frozen with, by name; all without names."""
-        first = self.runner.first_hyperparameters
+        first = self.session.first_hyperparameters
         for name in names:
             self.controls.control(name)
         return {name: first[name] for name in names or self.controls.values if name in first}
@@ -163,7 +165,7 @@ class Tuning:
         entry = find()
         if entry is None:
             return False
-        values = {name: value for name, value in entry.values.items() if name in self.runner.hyperparameters}
+        values = {name: value for name, value in entry.values.items() if name in self.session.hyperparameters}
         with self._lock:
             self.screen.log(*self.controls.follow(values, is_return=True))
             self.session.want(values)
@@ -213,6 +215,14 @@ class Tuning:
 
     def _request(self) -> None:
         self.worker.post("compute", partial(self._compute, perf_counter_ns()))
+
+    def _frame_arrived(self) -> None:
+        """Have the newest frame of the camera computed when the picture on its way has been painted."""
+        self.worker.post("live", partial(self._compute, 0), is_work=False)
+
+    def values_of(self, run: Run) -> dict[str, Any]:
+        """Return the hyperparameters of a run, and the settings of the camera."""
+        return {**self.session.hyperparameters, **run.hyperparameters}
 
     def _runner_changed(self) -> None:
         if not self.worker.is_current:
@@ -292,9 +302,13 @@ class Tuning:
         return run, is_settled
 
     def _run(self, targets: Sequence[str], *, is_wanted: bool) -> tuple[Run, bool]:
-        return self.session.bring_up_to_date(
+        found = self.session.bring_up_to_date(
             targets, is_wanted=is_wanted, is_superseded=self._is_superseded, report=self.screen.note
         )
+        for text in self.session.refusals():
+            self.screen.log(text)
+            self.screen.note(text)
+        return found
 
     def _refuse(self, error: Exception) -> None:
         """Say why there is no run."""
@@ -388,7 +402,7 @@ class Tuning:
             "compute_ms": self.screen.compute_ms,
             "numbers": numbers,
         }
-        if self.history.commit(run.hyperparameters, image=image, token=token, **about) is None and current is not None:
+        if self.history.commit(self.values_of(run), image=image, token=token, **about) is None and current is not None:
             current.numbers.update(numbers)
 
     def _late_tiles(self, run: Run) -> tuple[str, ...]:

@@ -48,7 +48,7 @@ class Worker:
         self._name, self._failed = name, failed or self._log
         self._condition = threading.Condition()
         self._closed = False
-        self._running: str | None = None
+        self._running: _Request | None = None
         self._waiting: dict[str, _Request] = {}
         # When the thread wakes by itself; 0 while it is awake.
         self._wakes_s = 0.0
@@ -66,7 +66,8 @@ class Worker:
 
     def is_pending(self, key: str) -> bool:
         """Whether a request of this key waits or runs."""
-        return key in self._waiting or self._running == key
+        running = self._running
+        return key in self._waiting or (running is not None and running.key == key)
 
     def is_superseded(self, key: str) -> bool:
         """Whether a newer request of this key waits for the one that runs, or the worker is closed."""
@@ -145,7 +146,8 @@ class Worker:
             raise StillRunning(self._name, (), timeout_s)
 
     def _is_done(self) -> bool:
-        return self._running is None and not any(request.is_work for request in self._waiting.values())
+        requests = [*self._waiting.values(), *filter(None, [self._running])]
+        return not any(request.is_work for request in requests)
 
     def _log(self, error: BaseException) -> None:
         _LOG.error("Work on the thread %s has failed", self._name, exc_info=error)
@@ -169,7 +171,7 @@ class Worker:
                 request = min(self._waiting.values(), key=attrgetter("due_s"), default=None)
                 now_s = monotonic()
                 if request is not None and request.due_s <= now_s:
-                    self._running = request.key
+                    self._running = request
                     del self._waiting[request.key]
                     return request.call
                 self._wakes_s = min(now_s + _IDLE_S, inf if request is None else request.due_s)

@@ -69,12 +69,13 @@ def _by_functions(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[
     for control in controls:
         folders.setdefault(_takers(cg, control.names[0]), []).append(control)
     places = {function: place for place, function in enumerate(cg.functions)}
-    yield from sorted(folders.items(), key=lambda folder: (places[folder[0][0]], len(folder[0])))
+    # Those of a camera come first, as it does.
+    yield from sorted(folders.items(), key=lambda folder: (places.get(folder[0][0], -1), len(folder[0])))
 
 
 def _takers(cg: CompGraph, name: str) -> tuple[str, ...]:
-    """Return the functions that take a hyperparameter; of one inside a pipeline, the pipeline."""
-    inside = [function for function in cg.functions if name.startswith(f"{function}__")]
+    """Return the functions that take a hyperparameter; of one inside a pipeline, the pipeline; else the camera."""
+    inside = [function for function in cg.functions if name.startswith(f"{function}__")] or ["camera"]
     return tuple(dict.fromkeys(cg.digraph.consumers.get(name, inside[:1])))
 
 

@@ -500,8 +500,12 @@ class LineControl(SingleControl):
 # -- of a runner ------------------------------------------------------------------------------------------------------
 
 
-def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
+def controls(
+    runner: Tunable, hints: Mapping[str, Any], settings: Mapping[str, tuple[Any, Param]] | None = None
+) -> tuple[Control, ...]:
     """Return the controls of a runner's hyperparameters, in graph order; a pair stands where its first token does.
+
+    Those of the settings of a camera come first, each given by its value and what it may be.
 
     Raises
     ------
@@ -512,6 +516,9 @@ def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
     pairs = {along.name: pair for pair in _pairs(params, values) for along in pair}
     appearance = Appearance(runner.cg)
     made: dict[str, Control] = {}
+    for name, (value, setting) in (settings or {}).items():
+        made[name] = _single(name, value, setting, value, tooltip(runner.cg, name, setting), appearance)
+        made[name].tip = tooltip(runner.cg, name, setting)
     for token, param in params.items():
         if token in made:
             continue
