@@ -12,6 +12,8 @@ from tests.benchmarks import (
     batch_sweep,
     brokers,
     case,
+    cpp,
+    cpp_service,
     engine,
     imports,
     mutable_state,
@@ -37,10 +39,12 @@ _MODULES = (
         sockets,
         brokers,
         service,
+        cpp_service,
         promotion,
         batch_map,
         batch_sweep,
         case,
+        cpp,
     ),
     tuning,
 )
@@ -63,6 +67,8 @@ def main() -> None:
     for venue in brokers.venues.ALL:
         if venue.missing():
             console.print(f"Left out: {venue.missing()}.")
+    if cpp_service.missing():
+        console.print(f"Left out: the service in C++. Missing: {cpp_service.missing()}.")
     if tuning.missing():
         console.print(f"Left out: tuning in a browser. {tuning.missing()}")
     write_json(rows, absent, Path("test-output") / "benchmarks.json")

@@ -65,7 +65,8 @@ class Client:
     allow
         With keys: the service's public key, or its .key file.
     sub, pub
-        The addresses that the service was given, where a broker needs a password: the state file leaves it out.
+        The addresses that the service was given: for a service that no state file names, as one on another machine or
+        one in C++; or where a broker needs a password, which the state file leaves out.
 
     Raises
     ------
@@ -88,12 +89,23 @@ class Client:
         self.path, self.timeout_s = path, timeout_s
         self._has_keys = keys is not None
         self._turn = threading.Lock()
-        state = _running(path)
+        # Otherwise nothing on this machine says whether it still runs.
+        self._has_state = not (sub and pub)
+        if self._has_state:
+            try:
+                state = _running(path)
+            except ServiceError as error:
+                if not (sub or pub):
+                    raise
+                missing = "pub" if sub else "sub"
+                text = f"{missing} (--{missing}) is missing: give both addresses of a service that has no state here."
+                raise ServiceError(path, f"{error} {text}") from None
+            sub, pub = sub or state.sub, pub or state.pub
         self._rgb = read_settings(Path(path) / SETTINGS).rgb
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._subscriber = _subscriber_to(path, pub or state.pub, self._answers, keys=keys, allow=allow)
-        self._publisher = Publisher(sub or state.sub, self._requests, bind=False, keys=keys, allow=allow)
+        self._subscriber = _subscriber_to(path, pub, self._answers, keys=keys, allow=allow)
+        self._publisher = Publisher(sub, self._requests, bind=False, keys=keys, allow=allow)
 
     def __enter__(self) -> Self:
         deadline = monotonic() + self.timeout_s
@@ -160,7 +172,7 @@ class Client:
         refused = self._publisher.rejected - refused_before
         if refused:
             raise ServiceError(self.path, f"The event could not be sent: {', '.join(refused)}.")
-        if not read_states(self.path):
+        if self._has_state and not read_states(self.path):
             raise ServiceError(self.path, f"The service of {self.path} ended before it answered. Look at its log.")
 
 
@@ -192,6 +204,12 @@ def _running(path: str | Path) -> ServiceState:
     if state is None:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     for address in (state.sub, state.pub):
+        if "type" in parse_address(address).options:
+            text = (
+                f"The service of {path} has messages of ROS 2 at {address}. They do not say which event an answer is "
+                "to: send the event with ep.Publisher, and read the answers with ep.Subscriber."
+            )
+            raise ServiceError(path, text)
         # The address of a broker has no such prefix: service and callers connect to it alike.
         if address.startswith("connect:"):
             text = f"The service of {path} connects to {address.removeprefix('connect:')}; send your events there."

@@ -195,13 +195,14 @@ def _state_folder() -> Check:
 
 
 def _address(address: str) -> Check:
-    """Check that an address can be bound now, or that a broker has it."""
+    """Check that an address can be bound now, that a broker has it, or that it can be opened."""
     from urllib.parse import urlsplit
 
-    from epypes.transport.address import is_broker
+    from epypes.transport.address import SCHEMES
 
-    if is_broker(address):
-        return _broker_address(address)
+    scheme = SCHEMES.get(address.partition("://")[0])
+    if scheme is not None and not scheme.is_zeromq:
+        return _open_address(address)
     name = f"address {address}"
     way_out = "Write tcp://127.0.0.1:5555, http://127.0.0.1:8642, or a broker's, as amqp://HOST/QUEUE."
     try:
@@ -223,14 +224,14 @@ def _address(address: str) -> Check:
     return Check(name, "ok", "free")
 
 
-def _broker_address(address: str) -> Check:
+def _open_address(address: str) -> Check:
     from epypes.transport.address import open_channel, parse_address
 
     place = parse_address(address)
     channel = open_channel(place)
     channel.open(None)
     channel.close()
-    return Check(f"address {place}", "ok", "the broker answers, and has it")
+    return Check(f"address {place}", "ok", "the broker answers, and has it" if place.is_broker else "it can be opened")
 
 
 def _keys(path: Path) -> Check:

@@ -21,7 +21,7 @@ from epypes.bundle.manifest import SETTINGS, check_manifest
 from epypes.bundle.requirements import epypes_source, pins
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
-from epypes.transport.address import is_broker, parse_address
+from epypes.transport.address import SCHEMES, is_broker
 
 # Python 3.11 is the oldest that EPypes runs on; the container takes the one that the bundle was proved with.
 _PYTHON: Final = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -243,7 +243,8 @@ def _extras(options: Sequence[str]) -> set[str]:
         if name == "--store":
             found.add("postgres" if value.startswith("postgres") else "store")
         else:
-            found.add(parse_address(value).extra if is_broker(value) else "serve")
+            scheme = SCHEMES.get(value.partition("://")[0])
+            found.add("serve" if scheme is None else scheme.extra)
     return found - {""}
 
 

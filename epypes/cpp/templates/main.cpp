@@ -1,0 +1,146 @@
+// @MARK@
+// Runs the graph on one image, or on values in a file of cv::FileStorage, and writes its outputs.
+#include <cstdlib>
+#include <exception>
+#include <iostream>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+
+#include <opencv2/imgcodecs.hpp>
+#include <opencv2/imgproc.hpp>
+
+#include "graph.hpp"
+#include "values.hpp"
+
+namespace {
+
+constexpr const char* usage = R"(Usage: @NAME@ INPUT [--out FOLDER] [--HYPERPARAMETER VALUE ...] [-h | --help]
+
+INPUT is an image, or a file of cv::FileStorage with a value for each input, as those in samples/. Images are written to
+FOLDER as PNG, all other outputs to results.yml there. Hyperparameters:
+)";
+
+/// A command line that can't be understood.
+class UsageError : public std::runtime_error {
+  public:
+    using std::runtime_error::runtime_error;
+};
+
+template <class T>
+constexpr bool is_plain = std::is_arithmetic_v<T> || std::is_same_v<T, std::string>;
+
+void print_usage(std::ostream& stream) {
+    stream << usage;
+    @NS@::Hyperparameters hyperparameters;
+    @NS@::Hyperparameters::each(hyperparameters, [&](const char* name, const auto& member) {
+        if constexpr (is_plain<std::decay_t<decltype(member)>>) {
+            stream << "  --" << name << " " << values::text(member) << "\n";
+        }
+    });
+}
+
+/// Changes a hyperparameter by its name; returns whether there is one.
+bool change(@NS@::Hyperparameters& hyperparameters, const std::string& name, const std::string& value) {
+    bool found = false;
+    @NS@::Hyperparameters::each(hyperparameters, [&](const char* own, auto& member) {
+        if (name == own) {
+            using T = std::decay_t<decltype(member)>;
+            if constexpr (is_plain<T>) {
+                member = values::parse<T>(value);
+            } else {
+                throw std::invalid_argument(name + " can only be changed in the program");
+            }
+            found = true;
+        }
+    });
+    return found;
+}
+
+void read_inputs(const std::string& path, @NS@::Inputs& inputs) {
+@IMAGE_IN@    const cv::FileStorage file(path, cv::FileStorage::READ);
+    if (!file.isOpened()) {
+        throw std::invalid_argument(path + " can't be read");
+    }
+    @NS@::Inputs::each(inputs, [&](const char* name, auto& member) {
+        if (file[name].empty()) {
+            throw std::invalid_argument(path + " has no value for " + name);
+        }
+        values::read_value(file[name], member);
+    });
+}
+
+void write_outputs(const std::string& folder, const @NS@::Outputs& outputs) {
+    cv::FileStorage file(folder + "/results.yml", cv::FileStorage::WRITE);
+    if (!file.isOpened()) {
+        throw std::invalid_argument(folder + " is no folder that can be written to");
+    }
+    @NS@::Outputs::each(outputs, [&](const char* name, const auto& member) {
+        if constexpr (std::is_same_v<std::decay_t<decltype(member)>, cv::Mat>) {
+            const bool is_image = (member.depth() == CV_8U || member.depth() == CV_16U) && member.channels() != 2;
+            if (is_image && member.channels() <= 4 && !member.empty()) {
+                cv::imwrite(folder + "/" + name + ".png", member);
+                std::cout << name << ": " << folder << "/" << name << ".png\n";
+                return;
+            }
+        }
+        file << name;
+        values::write_value(file, member);
+        std::cout << name << ": " << folder << "/results.yml\n";
+    });
+}
+
+int run(int count, char** arguments) {
+    @NS@::Hyperparameters hyperparameters;
+    std::string input;
+    std::string folder = ".";
+    for (int index = 1; index < count; ++index) {
+        const std::string argument = arguments[index];
+        if (argument == "-h" || argument == "--help") {
+            print_usage(std::cout);
+            return 0;
+        }
+        if (argument.rfind('-', 0) != 0) {
+            if (!input.empty()) {
+                throw UsageError("there is a second input, " + argument + ": it takes one");
+            }
+            input = argument;
+            continue;
+        }
+        if (index + 1 == count) {
+            throw UsageError("there is no option " + argument + ", or it needs a value");
+        }
+        const std::string value = arguments[++index];
+        if (argument == "--out") {
+            folder = value;
+        } else if (argument.rfind("--", 0) != 0 || !change(hyperparameters, argument.substr(2), value)) {
+            throw UsageError("there is no option " + argument);
+        }
+    }
+    if (input.empty()) {
+        throw UsageError("there is no input");
+    }
+    @NS@::Inputs inputs;
+    read_inputs(input, inputs);
+    @NS@::Graph graph(hyperparameters);
+    write_outputs(folder, graph.run(inputs));
+    for (std::size_t index = 0; index < graph.seconds().size(); ++index) {
+        std::cout << @NS@::Graph::functions[index] << ": " << 1e3 * graph.seconds()[index] << " ms\n";
+    }
+    return 0;
+}
+
+}  // namespace
+
+int main(int count, char** arguments) {
+    try {
+        return run(count, arguments);
+    } catch (const UsageError& error) {
+        std::cerr << error.what() << "\n\n";
+        print_usage(std::cerr);
+        return 2;
+    } catch (const std::exception& error) {
+        std::cerr << error.what() << "\n";
+        return 1;
+    }
+}

@@ -1,0 +1,226 @@
+"""A graph as a C++ project: its files, its build, its replay, and what is written by hand."""
+
+import gzip
+import json
+import re
+import shutil
+import subprocess
+import traceback
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+import epypes as ep
+from epypes.cli import app
+from epypes.errors import BundleError
+
+LEVEL = 20
+
+
+def gray(image):
+    return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+
+def blurred(gray, blur_kernel=5):
+    return cv2.GaussianBlur(gray, (blur_kernel, blur_kernel), 0)
+
+
+def above(pixels, level):
+    return pixels > level + LEVEL
+
+
+def bright(blurred, level=100):
+    mask = above(blurred, level)
+    return np.uint8(mask) * 255
+
+
+@ep.outputs("area", "rows")
+def measured(bright):
+    return int((bright > 0).sum()), bright.sum(axis=1)
+
+
+def steady(area, before, weight=0.25):
+    if before is None:
+        return np.array([[area, 0.0]])
+    return before * (1 - weight) + weight * area
+
+
+def middle(blurred):
+    return float(np.median(blurred))
+
+
+def photograph(radius):
+    image = np.zeros((40, 50, 3), np.uint8)
+    cv2.circle(image, (25, 20), radius, (250, 240, 230), -1)
+    return image
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    cg = ep.CompGraph.from_functions(gray, blurred, bright, measured, steady, middle)
+    runner = ep.CompGraphRunner(ep.delay(cg, "steady", "before", initial=None))
+    runner.run(image=photograph(9))
+    path = tmp_path_factory.mktemp("bundles") / "spots"
+    outputs = ["bright", "area", "rows", "steady", "middle"]
+    return ep.promote(runner, path, outputs, samples=[photograph(12), photograph(5)]).path
+
+
+@pytest.fixture(scope="module")
+def project(bundle, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("projects") / "spots_cpp"
+    ep.export_cpp(bundle, folder)
+    return folder
+
+
+def built(folder, *options):
+    # Without optimizing, which takes most of the time.
+    configure = [
+        "cmake",
+        "-S",
+        folder,
+        "-B",
+        folder / "build",
+        "-DCMAKE_BUILD_TYPE=None",
+        "-DCMAKE_CXX_FLAGS=-O0 -Werror",
+    ]
+    for command in (configure, ["cmake", "--build", folder / "build"]):
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+    return subprocess.run([folder / "build" / "replay", *options], capture_output=True, text=True)
+
+
+def test_the_table_says_what_is_translated_and_why_the_rest_is_not(bundle, tmp_path):
+    done = ep.export_cpp(bundle, tmp_path / "cpp")
+    assert [each.function for each in done.functions if each.is_by_hand] == ["middle"]
+    reason = "np.median has no translation, in: return float(np.median(blurred))"
+    assert str(done).splitlines()[-1].split(maxsplit=1) == ["middle", reason]
+
+
+def test_the_command_prints_the_table_also_as_json(bundle, tmp_path):
+    arguments = ["export", "cpp", str(bundle), "--to", str(tmp_path / "cpp")]
+    printed = CliRunner().invoke(app.app, arguments).output
+    assert "gray      yes" in printed
+    assert "np.median has no translation" in printed
+    functions = json.loads(CliRunner().invoke(app.app, [*arguments, "--json"]).output)["functions"]
+    assert functions[0] == {"function": "gray", "translated": True, "reason": "", "line": ""}
+
+
+def test_the_same_bundle_gives_the_same_bytes(bundle, project, tmp_path):
+    ep.export_cpp(bundle, tmp_path / "cpp")
+    files = [path.relative_to(tmp_path / "cpp") for path in (tmp_path / "cpp").rglob("*") if path.is_file()]
+    assert len(files) > 8
+    assert all((tmp_path / "cpp" / file).read_bytes() == (project / file).read_bytes() for file in files)
+
+
+def test_a_folder_that_is_no_export_is_not_touched(bundle, tmp_path):
+    (tmp_path / "main.cpp").write_text("int main() {}")
+    with pytest.raises(BundleError, match="Name another folder"):
+        ep.export_cpp(bundle, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["main.cpp"]
+
+
+def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
+    def sizes(image):
+        return {"height": image.shape[0]}
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"sizes": sizes}, {"sizes": ("image", "found")}))
+    runner.run(image=photograph(3))
+    with pytest.raises(BundleError, match="token 'found' are a dict") as refused:
+        ep.export_cpp(runner, tmp_path / "cpp")
+    assert "Leave it out of the outputs, or have 'sizes' return a tuple" in str(refused.value)
+    # The frames are those of the caller and of the exporting module, none below.
+    assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
+
+
+def test_numpy_1_is_refused(bundle, tmp_path, monkeypatch):
+    monkeypatch.setattr(np, "__version__", "1.26.4")
+    with pytest.raises(BundleError, match=r"needs NumPy 2, .* NumPy 1\.26\.4 is installed"):
+        ep.export_cpp(bundle, tmp_path / "cpp")
+
+
+def test_a_function_by_hand_whose_signature_has_changed_is_named(bundle, tmp_path):
+    by_hand = ep.export_cpp(bundle, tmp_path / "cpp").path / "by_hand.cpp"
+    head = '#include "graph.hpp"\nnamespace spots {\n'
+    by_hand.write_text(f"{head}double middle(const cv::Mat &image) {{ return image.rows; }}\n}}\n")
+    assert "signature of" not in str(ep.export_cpp(bundle, tmp_path / "cpp"))
+    by_hand.write_text(f"{head}double middle(const cv::Mat &image, int size) {{ return image.rows; }}\n}}\n")
+    was, now = "double middle(const cv::Mat &image, int size)", "double middle(const cv::Mat& blurred)"
+    printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
+    assert f"signature of middle has changed: was {was}, is {now}" in printed
+
+
+@pytest.mark.slow
+def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bundle, project, tmp_path):
+    folder = tmp_path / "spots_cpp"
+    shutil.copytree(project, folder)
+    done = built(folder)
+    assert done.returncode == 1
+    lines = done.stdout.splitlines()
+    assert "sample 002, steady, steady: bit-identical" in lines
+    assert "sample 000, middle, middle is still to be written by hand: see by_hand.cpp" in lines
+    others = [line for line in lines if " middle, " not in line and "whole_graph" not in line]
+    assert len(others) == 3 * 6
+    assert all(line.endswith("bit-identical") for line in others)
+
+    # One that is wrong is seen, also by a tolerance that is too small; it stays at the next export, as it is.
+    by_hand = folder / "by_hand.cpp"
+    stub = by_hand.read_text()
+    assert "//         return float(np.median(blurred))" in stub
+    wrong = stub.replace(
+        'throw std::logic_error("middle is still to be written by hand: see by_hand.cpp");', "return 1.5;"
+    )
+    by_hand.write_text(wrong)
+    ep.export_cpp(bundle, folder)
+    assert by_hand.read_text() == wrong
+    done = built(folder)
+    assert "sample 000, middle, middle: expected 0, got 1.5; 1 differ, by at most 1.5" in done.stdout
+    assert done.returncode == 1
+    assert run(folder, "replay", "--tolerance", "middle=1").returncode == 1
+    done = run(folder, "replay", "--tolerance", "middle=2")
+    assert (done.returncode, done.stdout.count("within the tolerance")) == (0, 6)
+    assert "sample 002, whole_graph, steady: bit-identical" in done.stdout
+    tested = subprocess.run(["ctest", "--test-dir", folder / "build"], capture_output=True, text=True)
+    assert "71% tests passed, 2 tests failed out of 7" in tested.stdout
+
+    # No tolerance allows another shape.
+    sample = folder / "samples" / "000.yml.gz"
+    text = gzip.decompress(sample.read_bytes()).decode()
+    turned = re.sub(r"(\nbright:.*?rows: )40(.*?cols: )50", r"\g<1>50\g<2>40", text, flags=re.DOTALL)
+    sample.write_bytes(gzip.compress(turned.encode()))
+    shapes = "expected 50 x 40 of type CV_8UC1, got 40 x 50 of type CV_8UC1"
+    done = run(folder, "replay", "--only", "bright", "--tolerance", "bright=255")
+    assert done.stdout.splitlines()[0] == f"sample 000, bright, bright: the shape or the type differs: {shapes}"
+
+    # Command lines are refused with what there is.
+    refused = run(folder, "replay", "--tolerance", "brigth=1")
+    assert (refused.returncode, "there are gray, blurred, bright, area, rows" in refused.stderr) == (2, True)
+    photo = tmp_path / "photo.png"
+    for program, *options in (("replay", "--quick", "1"), ("spots", photo, "--levle", "1"), ("spots", photo, photo)):
+        refused = run(folder, program, *options)
+        assert (refused.returncode, f"Usage: {program}" in refused.stderr) == (2, True), refused.stderr
+    for program in ("replay", "spots"):
+        assert run(folder, program, "--help").stdout.startswith(f"Usage: {program}")
+
+    # The program runs the graph, and refuses a value that is out of its range.
+    cv2.imwrite(str(photo), photograph(12))
+    cv2.imwrite(str(tmp_path / "16 bits.png"), photograph(12).astype(np.uint16) * 256)
+    cv2.imwrite(str(tmp_path / "gray.png"), gray(photograph(12)))
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the camera was turned
+    Image.fromarray(photograph(12)).save(tmp_path / "turned.png", exif=exif)
+    assert cv2.imread(str(tmp_path / "turned.png")).shape == (50, 40, 3)
+    for name in ("photo", "16 bits", "gray", "turned"):
+        image = tmp_path / f"{name}.png"
+        shown = run(folder, "spots", image, "--out", tmp_path, "--level", "120", "--blur_kernel", "3")
+        assert shown.returncode == 0, shown.stderr
+        expected = bright(blurred(gray(cv2.imread(str(image))), 3), 120)
+        assert np.array_equal(cv2.imread(str(tmp_path / "bright.png"), cv2.IMREAD_UNCHANGED), expected), name
+    refused = run(folder, "spots", photo, "--blur_kernel", "4")
+    assert (refused.returncode, refused.stderr) == (1, "blur_kernel has to be at least 1 and odd\n")
+
+
+def run(folder, program, *arguments):
+    return subprocess.run([folder / "build" / program, *arguments], capture_output=True, text=True)
