@@ -18,25 +18,24 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
 
-test: $(VENV)/.test chromium postgres packages
+test: $(VENV)/.test $(VENV)/.ros2 chromium postgres packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	@sh .ci/matrix $(BIN)/python lowest
 	$(PYTEST) -m "not soak"
 
 # The long forms: every combination, long series, and far more examples for what searches at random:
 # a quarter of an hour.
-soak: $(VENV)/.test chromium postgres packages
+soak: $(VENV)/.test $(VENV)/.ros2 chromium postgres packages
 	EPYPES_SOAK=1 $(PYTEST) -m "soak or fuzz" -o timeout=3600 -o faulthandler_timeout=3000
 
-# The default selection on every other Python that is found, and on the lowest versions that pyproject.toml admits;
-# `make test` runs a part of it.
+# The default selection on every other Python that is found, and on the lowest versions that pyproject.toml admits.
 test-matrix: $(VENV)/.test
 	@sh .ci/matrix $(BIN)/python 3.12 3.13 3.14 lowest
 
 lab: $(VENV)/.all
+	$(PIP) --editable '.[all,basler]'
 	$(BIN)/epypes lab notebooks
 
 bench: $(VENV)/.bench
@@ -77,6 +76,12 @@ $(VENV)/.all: pyproject.toml | $(BIN)/python
 $(VENV)/.test: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[all]' --group test --group docs
 	touch $@ $(VENV)/.all
+
+# The nodes of ROS 2 that the tests exchange images with, in an environment of their own.
+$(VENV)/.ros2: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m venv --without-pip $(VENV)/ros2
+	$(BIN)/python -m uv pip install --quiet --compile-bytecode --python $(VENV)/ros2/bin/python --group ros2
+	touch $@
 
 $(VENV)/.bench: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[all]' --group test --group docs --group bench

@@ -76,14 +76,15 @@ for folder in ("tutorials", "reference/generated"):
 
 # Sphinx reads what is below this folder, so the tutorials are copied into it.
 (DOCS / "tutorials").mkdir()
-for pattern in ("*.ipynb", "09_ros2_and_dds.md", "lanes.py", "test_lanes.py"):
+for pattern in ("*.ipynb", "lanes.py", "test_lanes.py"):
     for path in (DOCS.parent / "notebooks").glob(pattern):
         shutil.copy2(path, DOCS / "tutorials")
 
 
 def link_tutorials(app: Sphinx, page: str, source: list[str]) -> None:
-    """Turn a link to a notebook, as it is right in the repository, into one to its page."""
-    source[0] = re.sub(r"\]\(((?:\.\./)*)\.\./notebooks/", r"](\1tutorials/", source[0])
+    """Turn links to and in notebooks, as they are right in the repository, into those between their pages."""
+    to_notebooks = re.sub(r"\]\(((?:\.\./)*)\.\./notebooks/", r"](\1tutorials/", source[0])
+    source[0] = to_notebooks.replace("](../docs/", "](../")
 
 
 def add_examples(app: Sphinx, ctx: click.Context, lines: list[str]) -> None:

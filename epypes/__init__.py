@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from epypes.batch.mapping import SweepResult, sweep
     from epypes.batch.optimize import optimize
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
+    from epypes.cpp import export_cpp
     from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import (
         CompGraph,
@@ -139,6 +140,7 @@ _HOMES = {
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "connect": "epypes.service.remote.connection",
+    "export_cpp": "epypes.cpp",
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
@@ -194,6 +196,7 @@ __all__ = [
     "connect",
     "delay",
     "errors",
+    "export_cpp",
     "extend",
     "group",
     "load",

@@ -24,7 +24,7 @@ Everything an error's text mentions is an attribute of it::
     +-- SourceRefused           a graph can't be written as one function; .reasons
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
     +-- ImageFileError          an image file can't be read or written; .path
-    +-- CameraUnavailable       a camera gives no frame just now; .camera
+    +-- CameraUnavailable       a camera gives no frame just now; .camera .is_gone
     +-- FrameUnavailable        no frame is near enough to a time; .requested_ns, .oldest_ns, .newest_ns
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
@@ -354,10 +354,13 @@ class ImageFileError(_PathError, OSError):
 
 
 class CameraUnavailable(EpypesError, OSError):
-    """A camera that gives no frame just now; raised by its ``read``, it means: try again later."""
+    """A camera that gives no frame just now; raised by its ``read``, it means: try again later.
 
-    def __init__(self, camera: str, text: str) -> None:
-        self.camera = camera
+    ``is_gone`` if it is known to be unplugged or switched off.
+    """
+
+    def __init__(self, camera: str, text: str, *, is_gone: bool = False) -> None:
+        self.camera, self.is_gone = camera, is_gone
         super().__init__(text)
 
 

@@ -20,6 +20,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "anywidget": ("anywidget", "widgets"),
     "av": ("av", "vision"),
     "cv2": ("opencv-python-headless", "vision"),
+    "cyclonedds": ("cyclonedds", "dds"),
     "dask": ("dask", "cluster"),
     "distributed": ("distributed", "cluster"),
     "docstring_parser": ("docstring-parser", "widgets"),
@@ -50,6 +51,8 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "pydantic": ("pydantic", "serve"),
     "pydantic_core": ("pydantic-core", "serve"),
     "pygraphviz": ("pygraphviz", "graphviz"),
+    "pypylon": ("pypylon", "basler"),
+    "rosbags": ("rosbags", "dds"),
     "scipy": ("scipy", "scale"),
     "skimage": ("scikit-image", "scale"),
     "sqlalchemy": ("sqlalchemy", "store"),
@@ -58,8 +61,13 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "tqdm": ("tqdm", "scale"),
     "traitlets": ("traitlets", "widgets"),
     "uvicorn": ("uvicorn", "serve"),
+    "viva_genicam": ("viva-genicam", "genicam"),
+    "zenoh": ("eclipse-zenoh", "zenoh"),
     "zmq": ("pyzmq", "serve"),
 }
+
+# Packages that newer versions of Python have no wheel of: the first of these versions.
+NO_WHEEL_FROM: Final[Mapping[str, tuple[int, int]]] = {"cyclonedds": (3, 14)}
 
 
 class LazyModule:

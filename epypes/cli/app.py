@@ -9,6 +9,7 @@ import click
 
 from epypes.cli.bundles import check, promote, verify
 from epypes.cli.call import call, demo
+from epypes.cli.cameras import cameras
 from epypes.cli.experiment import experiment
 from epypes.cli.failures import failures, replay
 from epypes.cli.lab import lab
@@ -23,7 +24,7 @@ _TOPICS = {
     "A running service": (serve, call, status, set_parameters, reset, deploy, rollback, stop),
     "Failures": (failures, replay),
     "Recordings": (record, play),
-    "This machine": (lab, doctor, keys, export, completion),
+    "This machine": (lab, cameras, doctor, keys, export, completion),
     "The paper": (experiment,),
 }
 app = Group(

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from epypes.cli.options import PATH, bundle_argument, command, json_option
+from epypes.cli.options import (
+    PATH,
+    allow_option,
+    bundle_argument,
+    command,
+    json_option,
+    keys_option,
+    parse_numbers,
+    seconds_option,
+)
+from epypes.cli.services import is_url, states_of
 from epypes.cli.terminal import json_of, print_table
-from epypes.errors import BundleError, ReplayDiffers, ScaleError
-from epypes.wording import counted, ended
+from epypes.errors import BundleError, ReplayDiffers, ScaleError, ServiceError
+from epypes.wording import counted, ended, without_access_key
 
 if TYPE_CHECKING:
     from epypes.batch.check import CheckOutcome
@@ -61,7 +71,11 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], s
         click.echo(f"Note: {assumptions}", err=True)
 
 
-@command("epypes verify services/edges", "epypes verify services/edges --fresh-env")
+@command(
+    "epypes verify services/edges",
+    "epypes verify services/edges --fresh-env",
+    "epypes verify services/edges --against tcp://127.0.0.1:5555,tcp://127.0.0.1:5556 --tolerance edges=1",
+)
 @bundle_argument
 @click.option("--fresh-env", is_flag=True, help="Replay in a new virtual environment of requirements.txt.")
 @click.option(
@@ -69,20 +83,54 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], s
     is_flag=True,
     help="Run the code although files were changed, to see which tokens differ. The exit status is still 1.",
 )
+@click.option(
+    "--against",
+    default="",
+    show_default=False,
+    help="Running service that computes the samples instead: its addresses EVENTS,ANSWERS, its URL, or the folder of "
+    "the bundle that it was started with.",
+)
+@click.option(
+    "--tolerance",
+    multiple=True,
+    callback=parse_numbers,
+    help="TOKEN=NUMBER: largest difference of a number that is accepted, with --against. May be repeated.",
+)
+@seconds_option("--timeout", 10.0, "Seconds to wait for each answer, with --against.", least=0.001)
+@keys_option
+@allow_option
 @json_option
-def verify(bundle: Path, fresh_env: bool, run_anyway: bool, as_json: bool) -> None:
+def verify(
+    bundle: Path,
+    fresh_env: bool,
+    run_anyway: bool,
+    against: str,
+    tolerance: Mapping[str, float],
+    as_json: bool,
+    **options: Any,
+) -> None:
     """Check that a bundle computes what the notebook computed.
 
     The command computes the recorded samples in a fresh process (a replay) and compares every token. The exit status is
     0 only if all tokens are identical.
+
+    With --against, a running service computes them, in Python or in C++, and nothing of the bundle is run here.
 
     A bundle is code: trust it like code. If a file has changed since promotion, nothing of the bundle is run. The
     manifest shows changes; it is no signature.
     """
     from epypes.bundle import verify as verify_bundle
 
+    if not against and (tolerance or options["keys"] or options["allow"]):
+        raise click.UsageError("--tolerance, --keys and --allow are for a running service: give --against too.")
+    if against and (fresh_env or run_anyway):
+        raise click.UsageError("--fresh-env and --run-anyway run the bundle here: leave --against out.")
+    service = f"service at {_without_secrets(against)}" if against else ""
     try:
-        report = verify_bundle(bundle, fresh_env=fresh_env, run_anyway=run_anyway)
+        if against:
+            report = _verify_service(bundle, against, tolerance, **options)
+        else:
+            report = verify_bundle(bundle, fresh_env=fresh_env, run_anyway=run_anyway)
     except BundleError as error:
         found = error.report if isinstance(error, ReplayDiffers) else None
         if as_json:
@@ -90,21 +138,45 @@ def verify(bundle: Path, fresh_env: bool, run_anyway: bool, as_json: bool) -> No
             click.echo(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1))
         elif found:
             click.echo(str(found))
-        raise BundleError(bundle, _describe_difference(bundle, found) if found else str(error)) from error
+        subject = f"The {service}" if against else str(bundle)
+        raise BundleError(bundle, _describe_difference(subject, found) if found else str(error)) from error
     if as_json:
         click.echo(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1))
         return
-    click.echo(f"{bundle}: {report}{' in a new environment' if fresh_env else ''}.")
+    where = " in a new environment" if fresh_env else f" by the {service}" if against else ""
+    click.echo(f"{bundle}: {report}{where}.")
     for note in report.notes:
         click.echo(f"Note: {note}", err=True)
 
 
-def _describe_difference(bundle: Path, report: ReplayReport) -> str:
+def _without_secrets(against: str) -> str:
+    """Return the addresses of a service without passwords, its URL without the access key, or its folder."""
+    from epypes.transport.address import parse_address
+
+    if "://" in against and not is_url(against):
+        return ",".join(str(parse_address(each)) for each in against.split(",", 1))
+    return without_access_key(against)
+
+
+def _verify_service(bundle: Path, against: str, tolerances: Mapping[str, float], **options: Any) -> ReplayReport:
+    """Verify a running service; raise ReplayDiffers if it computes something else."""
+    from epypes.service import verify_service
+
+    sub, comma, pub = against.partition(",")
+    if not comma:
+        if "://" in against and not is_url(against):
+            raise ServiceError(bundle, "There is one address. Give both: --against EVENTS,ANSWERS")
+        state = states_of(against)[0]
+        sub, pub = state.sub, state.pub
+    return verify_service(bundle, sub, pub, tolerances=tolerances, **options)
+
+
+def _describe_difference(subject: str, report: ReplayReport) -> str:
     """Return in one line what differs, and the likely cause."""
     tokens = ", ".join(dict.fromkeys(repr(difference.token) for difference in report.differences))
     found = f"in {counted(len(report.differences), 'place')}, token {tokens}" if tokens else "it has no samples"
     cause = f" Likely: {report.causes[0]}" if report.causes else ""
-    return f"{bundle} does not compute what was recorded: {found}.{cause}"
+    return f"{subject} does not compute what was recorded: {found}.{cause}"
 
 
 @command("epypes check services/edges cases.toml --junit report.xml")

@@ -34,7 +34,8 @@ _address_option: Final = functools.partial(
     click.option,
     default="",
     show_default=False,
-    help="Same address as for epypes serve. Needed only if the broker has a password.",
+    help="Same address as for epypes serve, with the password of a broker. With --sub and --pub the service may run "
+    "anywhere, also in C++.",
 )
 
 

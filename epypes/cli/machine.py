@@ -76,7 +76,7 @@ def _secret_state(file: Path) -> str:
 
 @command("epypes doctor services/edges --address tcp://127.0.0.1:5555")
 @click.argument("bundle", type=PATH, required=False, help="Folder of a bundle to check, too.")
-@click.option("--address", multiple=True, help="Address to check: one to bind, or a broker's. May be repeated.")
+@click.option("--address", multiple=True, help="Address to check: to bind, or to connect to. May be repeated.")
 @click.option("--keys", type=PATH, multiple=True, help="Key file to check. May be repeated.")
 @json_option
 def doctor(bundle: Path | None, address: Sequence[str], keys: Sequence[Path], as_json: bool) -> None:
@@ -105,7 +105,7 @@ def doctor(bundle: Path | None, address: Sequence[str], keys: Sequence[Path], as
 
 @click.group(cls=Group, examples=["epypes export systemd services/edges -- --http 127.0.0.1:8642"])
 def export() -> None:
-    """Write the files to run a service by systemd or in a container.
+    """Write files for systemd or a container, or the graph in C++.
 
     Options of epypes serve follow after two dashes (--).
     """
@@ -149,6 +149,28 @@ def docker(bundle: Path, options: Sequence[str], to: Path) -> None:
     _check_serve_options(bundle, options)
     path = write_container(bundle, to, options)
     click.echo(f"Wrote {path}. What to do with it stands at its top.")
+
+
+@export.command(examples=["epypes export cpp services/edges --to edges_cpp"])
+@bundle_argument
+@click.option("--to", type=PATH, required=True, help="Folder to write; an earlier export there is replaced.")
+@click.option(
+    "--service", is_flag=True, help="Add a program that serves the graph behind ZeroMQ, as epypes serve does."
+)
+@json_option
+def cpp(bundle: Path, to: Path, service: bool, as_json: bool) -> None:
+    """Write the graph as a C++ project that replays the samples.
+
+    Functions that cannot be translated are left to be written by hand, in by_hand.cpp, which is never replaced.
+    """
+    from epypes.cpp import export_cpp
+
+    done = export_cpp(bundle, to, service=service)
+    if as_json:
+        click.echo(json.dumps(done.to_dict(), indent=1))
+        return
+    click.echo(str(done))
+    click.echo(f"Wrote {to}. Build and test it as its README.md says.")
 
 
 def _check_serve_options(bundle: Path, options: Sequence[str]) -> None:

@@ -99,6 +99,20 @@ def refuse_nan(context: click.Context, option: click.Parameter, value: float | N
     return value
 
 
+def parse_numbers(context: click.Context, option: click.Parameter, texts: Sequence[str]) -> dict[str, float]:
+    """Parse ``NAME=NUMBER`` arguments, numbers of 0 or more."""
+    found = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            found[name] = math.nan
+        if not name or not 0 <= found[name] < math.inf:
+            raise click.BadParameter(f"{text!r} is no NAME=NUMBER with a number of 0 or more.", context, option)
+    return found
+
+
 def seconds_option(name: str, default: float, text: str, least: float = 0.0) -> Callable[[Callback], Callback]:
     """Return an option for a duration, whose text begins with "Seconds" and whose parameter ends in ``_s``."""
     parameter = f"{name.removeprefix('--').replace('-', '_')}_s"

@@ -183,6 +183,8 @@ def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **o
     amqp://HOST/QUEUE         - RabbitMQ; encrypted: amqps
     nats://HOST/SUBJECT       - NATS JetStream; encrypted: tls
     mqtt://HOST/TOPIC         - MQTT 5; encrypted: mqtts
+    dds://DOMAIN/TOPIC        - DDS and ROS 2, without a broker
+    zenoh://127.0.0.1/KEY     - Zenoh, without a broker; through a router: zenoh://HOST:PORT/KEY
 
     \b
     Options of a broker's address, after ? and separated by & (quote the address):
@@ -194,6 +196,12 @@ def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **o
     group=NAME                - replicas that share the events (NATS, MQTT)
     kind=broadcast            - send to all consumers, keep nothing
     vhost=NAME                - virtual host of RabbitMQ
+
+    \b
+    Options of DDS and Zenoh, of which the guides "ROS 2 and DDS" and "Zenoh" list more:
+    type=TYPE                 - messages of ROS 2, such as sensor_msgs/msg/Image
+    token=NAME                - with type=: token that is published
+    interface=NAME            - network interface (DDS); without it, this machine alone
     """  # noqa: D301 - click keeps the lines of a paragraph that begins with it
     from epypes.service import serve as serve_bundle
     from epypes.service.supervision.standard_error import STANDARD_ERROR

@@ -5,8 +5,9 @@ process are joined by in-process queues, processes by sockets.
 
 A `ChildStation` starts ``python -m epypes.experiment.layouts``. It writes one line of JSON to the standard input of
 the process: the nodes, their settings, and the address of their events. The process runs a `Station`, and writes one
-line of JSON to its standard output: the addresses of its answers and failures. It ends when its standard input is
-closed, which happens however its parent ends, so it never outlives its parent.
+line of JSON to its standard output: the addresses of its answers and failures. For each further line it writes the CPU
+time that it has taken. It ends when its standard input is closed, which happens however its parent ends, so it never
+outlives its parent.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from typing import Any, Final
 from epypes.errors import EpypesError, ExperimentError
 from epypes.experiment.nodes import COMPONENTS, Settings
 from epypes.pipeline import Mailbox
-from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.transport import Publisher, Subscriber
 
 _START_TIMEOUT_S: Final = 30.0
 # Messages that wait while a publisher is not connected: more than ever do, since the robot makes one request at a time.
@@ -46,6 +47,14 @@ _PRINTED_CHARACTERS: Final = 100_000
 LAYOUTS: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = MappingProxyType(
     {"paper": (("acquisition", "vision"),), "one": (), "three": (("acquisition",), ("vision",))}
 )
+# By transport an address for several processes, and one for a single process, each with room for a name of its own.
+TRANSPORTS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
+    {
+        "zeromq": ("tcp://127.0.0.1:*", "inproc://epypes-{}"),
+        "dds": ("dds://0/epypes_{}",) * 2,
+        "zenoh": ("zenoh://127.0.0.1/epypes/{}",) * 2,
+    }
+)
 
 
 class Station:
@@ -57,12 +66,14 @@ class Station:
         The nodes in the order in which an event passes them.
     settings
         The options of the nodes.
-    scheme
-        ``"tcp"``, or ``"inproc"`` for sockets within this process.
+    address
+        Of `TRANSPORTS`.
     """
 
-    def __init__(self, names: Sequence[str], settings: Settings, scheme: str) -> None:
-        self._scheme, self._running = scheme, contextlib.ExitStack()
+    cpu_s = 0.0
+
+    def __init__(self, names: Sequence[str], settings: Settings, address: str) -> None:
+        self._address, self._running = address, contextlib.ExitStack()
         self._q_in: Any = queue.SimpleQueue()
         # Mailboxes, whose items are sent by the thread that puts them: no other one has to wake up for that.
         self._q_out, self._q_failures = Mailbox("drop_oldest", _QUEUE_SIZE), Mailbox("drop_oldest", _QUEUE_SIZE)
@@ -82,14 +93,14 @@ class Station:
             A camera gives no frame, or nothing is published at the address.
         """
         enter = self._running.enter_context
-        answers = enter(ZMQPublisher(_new_address(self._scheme), self._q_out))
-        failures = enter(ZMQPublisher(_new_address(self._scheme), self._q_failures, topic="failures"))
+        answers = enter(Publisher(_new_address(self._address), self._q_out))
+        failures = enter(Publisher(_new_address(self._address), self._q_failures, topic="failures"))
         for node in reversed(self.nodes):
             enter(node)
         for node in self.nodes:
             if not node.wait_until_ready(_START_TIMEOUT_S):
                 raise ExperimentError(node.name, f"The {node.name} node has no images after {_START_TIMEOUT_S:g} s.")
-        subscriber = enter(ZMQSubscriber(source, self._q_in))
+        subscriber = enter(Subscriber(source, self._q_in))
         if not subscriber.wait_joined(_START_TIMEOUT_S):
             raise ExperimentError(self.nodes[0].name, f"Nothing is published at {source}.")
         return {"answers": answers.address, "failures": failures.address}
@@ -99,9 +110,9 @@ class Station:
         self._running.close()
 
 
-def _new_address(scheme: str) -> str:
-    """Return an address that can be bound: a free port of this machine, or a new name within this process."""
-    return "tcp://127.0.0.1:*" if scheme == "tcp" else f"inproc://epypes-{uuid.uuid4().hex}"
+def _new_address(address: str) -> str:
+    """Return an address with a name that no other one has; a port of ZeroMQ is found when it is bound."""
+    return address.format(uuid.uuid4().hex)
 
 
 class ChildStation:
@@ -115,13 +126,17 @@ class ChildStation:
         The nodes in the order in which an event passes them.
     settings
         The options of the nodes.
+    address
+        Of `TRANSPORTS`.
     on_end
         Called with an ExperimentError on a thread of its own, when the process ends and was not asked to.
     """
 
-    def __init__(self, names: Sequence[str], settings: Settings, on_end: Callable[[ExperimentError], None]) -> None:
+    def __init__(
+        self, names: Sequence[str], settings: Settings, address: str, on_end: Callable[[ExperimentError], None]
+    ) -> None:
         self.names, self.name, self.addresses = tuple(names), " and ".join(names), {"answers": "", "failures": ""}
-        self._settings, self._on_end, self._stopping = settings, on_end, False
+        self._settings, self._address, self._on_end, self._stopping = settings, address, on_end, False
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         # A file takes any amount without a reader, as a pipe does not.
         self._printed = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by stop()
@@ -148,19 +163,27 @@ class ChildStation:
         ExperimentError
             The process has ended, or answers nothing; its last output is in the text.
         """
-        request = {"nodes": self.names, "settings": asdict(self._settings), "source": source}
+        request = {"nodes": self.names, "settings": asdict(self._settings), "address": self._address, "source": source}
+        self.addresses = json.loads(self._ask(json.dumps(request)))
+        return self.addresses
+
+    @property
+    def cpu_s(self) -> float:
+        """The CPU time that the process has taken, in seconds."""
+        return float(self._ask("cpu"))
+
+    def _ask(self, line: str) -> str:
         with contextlib.suppress(OSError):  # the process has ended: its line is empty
-            print(json.dumps(request), file=self._stdin, flush=True)
+            print(line, file=self._stdin, flush=True)
         try:
             line = self._lines.get(timeout=_ANSWER_TIMEOUT_S)
         except queue.Empty:
-            text = f"The process of {self.name} ({self.pid}) does not start within {_ANSWER_TIMEOUT_S:g} s."
+            text = f"The process of {self.name} ({self.pid}) does not answer within {_ANSWER_TIMEOUT_S:g} s."
             raise ExperimentError(self.name, text, self._read_printed()) from None
         if not line:
             self._watcher.join()
             raise self._ended()
-        self.addresses = json.loads(line)
-        return self.addresses
+        return line
 
     def stop(self, timeout_s: float = _STOP_TIMEOUT_S) -> None:
         """Let the process end; it is killed if it takes longer than ``timeout_s``. May be called twice."""
@@ -175,8 +198,9 @@ class ChildStation:
         self._printed.close()
 
     def _watch(self) -> None:
-        self._lines.put(self._stdout.readline())
-        self._stdout.read()
+        for line in self._stdout:
+            self._lines.put(line)
+        self._lines.put("")
         self._process.wait()
         if not self._stopping:
             self._on_end(self._ended())
@@ -214,10 +238,15 @@ class System:
     inbox: Any
     stations: tuple[Station | ChildStation, ...]
 
+    @property
+    def cpu_s(self) -> float:
+        """The CPU time that all processes have taken, in seconds."""
+        return time.process_time() + sum(station.cpu_s for station in self.stations)
+
 
 @contextlib.contextmanager
-def running(processes: Sequence[Sequence[str]], settings: Settings) -> Iterator[System]:
-    """Run the nodes of a layout, one of `LAYOUTS`, while the block runs.
+def running(processes: Sequence[Sequence[str]], settings: Settings, transport: str = "zeromq") -> Iterator[System]:
+    """Run the nodes of a layout, one of `LAYOUTS`, over one of `TRANSPORTS`, while the block runs.
 
     Raises
     ------
@@ -226,22 +255,22 @@ def running(processes: Sequence[Sequence[str]], settings: Settings) -> Iterator[
     """
     requests = Mailbox("drop_oldest", _QUEUE_SIZE)
     inbox: Any = queue.SimpleQueue()
-    scheme = "tcp" if processes else "inproc"
+    address = TRANSPORTS[transport][not processes]
     stations: list[Station | ChildStation] = []
     with contextlib.ExitStack() as stack:
-        source, failures = stack.enter_context(ZMQPublisher(_new_address(scheme), requests)).address, []
+        source, failures = stack.enter_context(Publisher(_new_address(address), requests)).address, []
         for names in processes:
-            stations.append(ChildStation(names, settings, inbox.put))
+            stations.append(ChildStation(names, settings, address, inbox.put))
             stack.callback(stations[-1].stop)
         if not processes:
-            stations.append(Station(tuple(COMPONENTS), settings, scheme))
+            stations.append(Station(tuple(COMPONENTS), settings, address))
             stack.callback(stations[-1].stop)
         for station in stations:
             addresses = station.start(source)
             source = addresses["answers"]
             failures.append(addresses["failures"])
         for address in (source, *failures):
-            subscriber = stack.enter_context(ZMQSubscriber(address, inbox))
+            subscriber = stack.enter_context(Subscriber(address, inbox))
             if not subscriber.wait_joined(_START_TIMEOUT_S):
                 raise ExperimentError("robot", f"Nothing is published at {address}.")
         yield System(requests, inbox, tuple(stations))
@@ -261,14 +290,15 @@ def _run_station() -> None:
     has_ended = threading.Event()
 
     def end_with_parent() -> None:
-        parent.read()
+        while parent.readline():
+            os.write(answer, f"{time.process_time()}\n".encode())
         has_ended.set()
         # A camera that does not open may hold the main thread for ever.
         time.sleep(_STOP_TIMEOUT_S)
         os._exit(1)
 
     threading.Thread(target=end_with_parent, name="epypes parent", daemon=True).start()
-    station = Station(request["nodes"], Settings(**request["settings"]), "tcp")
+    station = Station(request["nodes"], Settings(**request["settings"]), request["address"])
     try:
         os.write(answer, f"{json.dumps(station.start(request['source']))}\n".encode())
         has_ended.wait()

@@ -6,6 +6,7 @@ Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,11 +49,24 @@ class Results:
         A row per request; durations are in seconds, and nan where ``failure`` says what failed.
     counts
         What else came to the robot: late answers, failures of no request, messages that are no answers.
+    transport
+        What carried the messages.
+    cpu_s
+        The CPU time of all processes during the requests, with that of the cameras, in seconds.
     """
 
     layout: str
     table: pd.DataFrame
     counts: Mapping[str, int] = field(default_factory=dict)
+    transport: str = "zeromq"
+    cpu_s: float = math.nan
+
+    def __add__(self, later: Results) -> Results:
+        """Return the results of one experiment and of others that followed it, alike in layout and transport."""
+        table = later.table.assign(experiment=later.table["experiment"] + self.table["experiment"].nunique())
+        counts = Counter(self.counts) + Counter(later.counts)
+        whole = pd.concat([self.table, table], ignore_index=True)
+        return Results(self.layout, whole, counts, self.transport, self.cpu_s + later.cpu_s)
 
     def to_csv(self, path: str | Path) -> None:
         """Write the table to a file, with every digit of the durations."""
@@ -148,6 +162,18 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
         found[time] = [len(values), fitted.left_out, *(_MS * value for value in in_s)]
     columns = ["requests", "not_positive", "median_ms", "mode_ms", "least_ms", "most_ms", "paper_mode_ms"]
     return pd.DataFrame.from_dict(found, orient="index", columns=columns)
+
+
+def comparison(results: Iterable[Results]) -> pd.DataFrame:
+    """Compare transports, a row for each, in milliseconds: trips, the network's part of them, and CPU per request."""
+    rows = {}
+    for each in results:
+        found = each.table[answered(each.table)]
+        times = [found[name] for name in ("t_trip", "o_network")]
+        in_s = [value for time in times for value in (lognormal_fit(time).mode, time.quantile(0.99))]
+        rows[each.transport] = [len(found), *(_MS * value for value in (*in_s, each.cpu_s / len(each.table)))]
+    columns = ["requests", "trip_mode_ms", "trip_p99_ms", "network_mode_ms", "network_p99_ms", "cpu_ms"]
+    return pd.DataFrame.from_dict(rows, orient="index", columns=columns)
 
 
 @dataclass(frozen=True, slots=True)

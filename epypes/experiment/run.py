@@ -8,14 +8,14 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.acquisition.cameras import LAST_DEVICE
 from epypes.errors import ExperimentError, MessageError
-from epypes.experiment.layouts import LAYOUTS, running
+from epypes.experiment.layouts import LAYOUTS, TRANSPORTS, running
 from epypes.experiment.nodes import REQUEST, T_VREQ, Settings, decode_keypoints
 from epypes.experiment.results import Results, row_of, table_of
 from epypes.wire import Envelope, Event, JustBytes, add_attribute, attributes, parsed
@@ -152,6 +152,7 @@ def run_experiment(
     progress: Callable[[int, int], None] | None = None,
     cameras: Sequence[str | Path | int] = (),
     timeout_s: float = 5.0,
+    transport: str = "zeromq",
 ) -> Results:
     """Run the paper's experiment: a robot asks, acquisition finds the images, vision finds the keypoints.
 
@@ -174,10 +175,12 @@ def run_experiment(
     progress
         Called with the requests made so far and those of all experiments, between two requests.
     cameras
-        Two sources as `epypes.camera` takes them, each a path or the number of a device; without, the stereo pair that
-        comes with scikit-image.
+        Two sources as `epypes.camera` takes them, each a path, an address or the number of a device; without, the
+        stereo pair that comes with scikit-image.
     timeout_s
         Longest wait for one answer.
+    transport
+        What carries the messages: ``"zeromq"``, ``"dds"`` or ``"zenoh"``.
 
     Returns
     -------
@@ -193,24 +196,21 @@ def run_experiment(
     -----
     Semeniuta and Falkman 2019, "Evaluation" (Figures 12 to 16).
     """
-    if layout not in list(LAYOUTS):
-        raise ExperimentError("layout", f"There is no layout {layout!r}. There are: {', '.join(LAYOUTS)}.")
-    for name, count in {"requests": requests, "experiments": experiments, "workers": workers}.items():
-        if type(count) is not int or count < 1:
-            raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
-    for name, number in {"fps": fps, "timeout_s": timeout_s}.items():
-        # No wait takes a longer time.
-        if not isinstance(number, int | float) or not 0 < number <= threading.TIMEOUT_MAX:
-            text = f"{name} must be a number above 0, and at most {threading.TIMEOUT_MAX:.0f}, not {number!r}."
-            raise ExperimentError(name, text)
+    _check_choices({"layout": (layout, LAYOUTS), "transport": (transport, TRANSPORTS)})
+    _check_numbers(
+        {"requests": requests, "experiments": experiments, "workers": workers}, {"fps": fps, "timeout_s": timeout_s}
+    )
     settings = Settings(_checked_cameras(cameras), fps, workers, unsafe_pickle)
     rows: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
+    cpu_s = 0.0
     for experiment in range(experiments):
-        with running(LAYOUTS[layout], settings) as system:
+        with running(LAYOUTS[layout], settings, transport) as system:
             robot = Robot(system.requests, system.inbox, timeout_s=timeout_s, unsafe_pickle=settings.unsafe_pickle)
             missing = 0
             for request in range(-_WARM_UP, requests):
+                if request == 0:
+                    cpu_s -= system.cpu_s
                 answer = robot.ask()
                 missing = missing + 1 if answer.is_missing else 0
                 if missing >= _MAX_MISSING:
@@ -221,8 +221,26 @@ def run_experiment(
                 rows.append(row_of(answer, experiment, request))
                 if progress is not None:
                     progress(len(rows), requests * experiments)
+            cpu_s += system.cpu_s
         counts += robot.counts
-    return Results(layout, table_of(rows), counts)
+    return Results(layout, table_of(rows), counts, transport, cpu_s)
+
+
+def _check_choices(choices: Mapping[str, tuple[Any, Iterable[str]]]) -> None:
+    for name, (value, known) in choices.items():
+        if value not in list(known):
+            raise ExperimentError(name, f"There is no {name} {value!r}. There are: {', '.join(known)}.")
+
+
+def _check_numbers(counts: Mapping[str, Any], times: Mapping[str, Any]) -> None:
+    for name, count in counts.items():
+        if type(count) is not int or count < 1:
+            raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
+    for name, number in times.items():
+        # No wait takes a longer time.
+        if not isinstance(number, int | float) or not 0 < number <= threading.TIMEOUT_MAX:
+            text = f"{name} must be a number above 0, and at most {threading.TIMEOUT_MAX:.0f}, not {number!r}."
+            raise ExperimentError(name, text)
 
 
 def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ...]:

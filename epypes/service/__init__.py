@@ -9,11 +9,12 @@ from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     from epypes.service.ops.client import Answer, Client, call
+    from epypes.service.ops.verification import verify_service
     from epypes.service.parameters import Parameters
     from epypes.service.service import Service
     from epypes.service.serving import serve
 
-__all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve"]
+__all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve", "verify_service"]
 
 _HOME = {
     "Answer": "ops.client",
@@ -22,6 +23,7 @@ _HOME = {
     "Service": "service",
     "call": "ops.client",
     "serve": "serving",
+    "verify_service": "ops.verification",
 }
 
 

@@ -479,8 +479,15 @@ class Dispatcher:
         is_returned = error is not None and self._has_broker
         if error is not None and not is_returned:
             result = self._results.report_lost(event, result, error)
+        if not self._is_confirmed:
+            if event.result is not None and event.result.outcome != result.outcome:
+                # It was counted when it was released; a failure has replaced the answer, which can't be published.
+                with self.lock:
+                    self._totals[event.result.outcome] -= 1
+                    self._totals[result.outcome] += 1
+            return
         if event.seq not in self._unconfirmed:
-            # No broker confirms it; or it was given back meanwhile, or dropped.
+            # It was given back meanwhile, or dropped.
             return
         if is_returned:
             event.delivery.nack()

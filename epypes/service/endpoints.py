@@ -16,7 +16,7 @@ from typing import Any, Final
 from epypes.errors import BrokerError
 from epypes.service.options import Options
 from epypes.transport import Publisher, Subscriber
-from epypes.transport.address import Address, is_broker, open_channel, parse_address
+from epypes.transport.address import Address, open_channel, parse_address
 from epypes.transport.channel import Confirmed, Delivery
 from epypes.transport.throttle import Throttle
 from epypes.transport.zeromq.channel import prepare_lending
@@ -365,6 +365,6 @@ def _named(address: str, trouble: str) -> str:
 
 
 def _secured(address: str, options: Options) -> Mapping[str, Any]:
-    """Return the options for peers of ZeroMQ, which other endpoints of the service may need; none for a broker."""
-    names = () if is_broker(address) else ("insecure", "keys", "allow")
+    """Return the options for peers of ZeroMQ, which other endpoints of the service may need; none for the others."""
+    names = ("insecure", "keys", "allow") if parse_address(address).is_zeromq else ()
     return {name: getattr(options, name) for name in names}

@@ -24,6 +24,7 @@ from epypes.service.options import ANY_PORT, Options
 from epypes.service.parameters import ParameterControl, Parameters
 from epypes.service.replication.replicas import Replicas
 from epypes.service.result_publisher import EventLog, Latency, Listener, Provenance, ResultPublisher
+from epypes.service.ros_messages import with_input_name
 from epypes.service.sd_notify import notify
 from epypes.service.state_file import ServiceState
 from epypes.service.supervision.supervisor import Supervisor
@@ -62,18 +63,19 @@ class Service:
     BundleError
         The folder is not the bundle that was promoted.
     AddressError
-        An address is not on loopback.
+        An address is not on loopback, or has messages of ROS 2 that can't be the events or answers of the bundle.
     ServiceError, StoreError
         The mailbox, a time-out or the number of threads is invalid, or the bundle has state between events, which these
         options would mix up; or the database can't be used.
     """
 
     def __init__(self, path: str | Path, sub: str = ANY_PORT, pub: str = ANY_PORT, **options: Any) -> None:
-        self.options = given = Options(sub, pub, **options)
+        given = Options(sub, pub, **options)
         given.check(path)
         bundle = read_bundle_info(path)
         if reason := why_refused(bundle.settings.states, given):
             raise ServiceError(bundle.path, reason)
+        self.options = given = with_input_name(given, bundle)
         self.path, self.threads = bundle.path, given.threads
         self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
         self.http = self.access_key_file = ""

@@ -10,18 +10,22 @@ import errno
 import importlib
 import ipaddress
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, get_args
-from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
+from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlencode, urlsplit
 
 from epypes.errors import AddressError, install_command
+from epypes.optional import NO_WHEEL_FROM
 from epypes.transport.channel import Channel, ChannelOptions
 
 Kind = Literal["queue", "broadcast", "log"]
 KINDS: Final = get_args(Kind)
 ATTEMPTS: Final = 3
+# Of brokers.
+_OPTIONS: Final = ("attempts", "ca", "create", "dead", "group", "kind", "password_file", "vhost")
 
 
 class Scheme(NamedTuple):
@@ -32,9 +36,16 @@ class Scheme(NamedTuple):
     port: int = 0
     is_broker: bool = True
     encrypted_as: str = ""
+    options: tuple[str, ...] = _OPTIONS
+
+    @property
+    def is_zeromq(self) -> bool:
+        """Whether its addresses are endpoints of ZeroMQ."""
+        return self.module == "zeromq.channel"
 
 
-# To add a broker: an entry here, and a module with ``make_channel`` and a `brokers.channel.BrokerSession`.
+# To add a broker: an entry here, and a module with ``make_channel`` and a `brokers.channel.BrokerSession`. To add a
+# middleware without a broker: likewise, with a `peers.channel.PeerSession`.
 SCHEMES: Final[Mapping[str, Scheme]] = {
     "amqp": Scheme("brokers.amqp", "rabbitmq", 5672, encrypted_as="amqps"),
     "amqps": Scheme("brokers.amqp", "rabbitmq", 5671),
@@ -43,17 +54,38 @@ SCHEMES: Final[Mapping[str, Scheme]] = {
     "mqtt": Scheme("brokers.mqtt", "mqtt", 1883, encrypted_as="mqtts"),
     "mqtts": Scheme("brokers.mqtt", "mqtt", 8883),
     "memory": Scheme("memory", ""),
+    "dds": Scheme(
+        "peers.dds",
+        "dds",
+        is_broker=False,
+        options=("deadline", "durability", "history", "interface", "lease", "reliability", "token", "type"),
+    ),
+    "zenoh": Scheme(
+        "peers.zenoh",
+        "zenoh",
+        is_broker=False,
+        options=("ca", "congestion", "domain", "password_file", "priority", "token", "type"),
+    ),
     "tcp": Scheme("zeromq.channel", "serve", is_broker=False),
     "ipc": Scheme("zeromq.channel", "serve", is_broker=False),
     "inproc": Scheme("zeromq.channel", "serve", is_broker=False),
 }
 _ENCRYPTED: Final = tuple(known.encrypted_as for known in SCHEMES.values() if known.encrypted_as)
-_OPTIONS: Final = ("attempts", "ca", "create", "dead", "group", "kind", "password_file", "vhost")
+# The options of DDS and Zenoh that are one of some words, and those that are a number: whole, or of seconds.
+_WORDS: Final[Mapping[str, tuple[str, ...]]] = {
+    "congestion": ("drop", "block"),
+    "durability": ("volatile", "transient_local"),
+    "priority": ("real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background"),
+    "reliability": ("reliable", "best_effort"),
+}
+_WHOLE_NUMBERS: Final = ("domain", "history")
+_SECONDS: Final = ("deadline", "lease")
 # Which side of two ZeroMQ sockets binds, where it is not the publisher.
 _SIDES: Final = {"bind": True, "connect": False}
 _FORM: Final = (
     "Write amqp://HOST/QUEUE, nats://HOST/SUBJECT or mqtt://HOST/TOPIC, with USER:PASSWORD@ before HOST, :PORT behind "
-    "it and ?create=true at the end as needed; or tcp://127.0.0.1:5555 for ZeroMQ."
+    "it and ?create=true at the end as needed; tcp://127.0.0.1:5555 for ZeroMQ; dds://DOMAIN/TOPIC or "
+    "zenoh://127.0.0.1/KEY."
 )
 _QUOTING: Final = "In a user, a password or a name write %2F for /, %3F for ?, %40 for @, %5B for [ and %5D for ]."
 _ZEROMQ_FORM: Final = (
@@ -73,16 +105,18 @@ _MAX_PORT: Final = 65_535
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A queue, a broadcast or a log at a broker; or a ZeroMQ endpoint.
+    """A queue, a broadcast or a log at a broker; a ZeroMQ endpoint; or a topic of DDS or Zenoh.
 
     Attributes
     ----------
     scheme, host, port
-        Where the broker listens, and its protocol.
+        Where the broker listens, and its protocol. The host of DDS is the number of its domain; that of Zenoh is its
+        router, or this machine without a port for the peers on it.
     user, password
         The credentials; empty without.
     name
-        Of the queue (RabbitMQ), the subject (NATS) or the topic (MQTT); for ZeroMQ the whole address.
+        Of the queue (RabbitMQ), the subject (NATS), the topic (MQTT, DDS) or the key (Zenoh); for ZeroMQ the whole
+        address.
     kind
         ``"queue"``: each message goes to one consumer, and is kept until that consumer has acknowledged it.
         ``"broadcast"``: each goes to all consumers that are connected just then, and is not kept. ``"log"``: all are
@@ -103,6 +137,8 @@ class Address:
         The file of the certificates that an encrypted broker is checked by; the system's without.
     password_file
         The file that the password was read from; empty if it was in the address.
+    options
+        What DDS and Zenoh have beside these, by name; `epypes.transport.peers` describes them.
     """
 
     scheme: str
@@ -119,25 +155,38 @@ class Address:
     vhost: str = "/"
     ca: str = ""
     password_file: str = field(default="", repr=False, compare=False)
+    options: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __str__(self) -> str:
         """Return the address without the password: for people, logs and state files."""
-        if not self.is_broker:
+        if self.is_zeromq:
             return self.name
         user = f"{quote(self.user, safe='')}@" if self.user else ""
         host = f"[{self.host}]" if ":" in self.host else self.host
         port = f":{self.port}" if self.port else ""
-        kind = "" if self.kind == "queue" else f"?kind={self.kind}"
-        return f"{self.scheme}://{user}{host}{port}/{quote(self.name, safe='/.-_~$#+*>')}{kind}"
+        if self.is_broker:
+            query = "" if self.kind == "queue" else f"?kind={self.kind}"
+        else:
+            # All of them: a service that is paused opens it again by this text.
+            files = {name: path for name in ("ca", "password_file") if (path := getattr(self, name))}
+            query = f"?{urlencode({**self.options, **files}, safe='/')}" if self.options or files else ""
+        return f"{self.scheme}://{user}{host}{port}/{quote(self.name, safe='/.-_~$#+*>')}{query}"
 
     @property
     def is_broker(self) -> bool:
-        """Whether a broker keeps and shares out the messages; otherwise it is an endpoint of ZeroMQ."""
+        """Whether a broker shares out the messages; those of ZeroMQ, DDS and Zenoh go from peer to peer."""
         return SCHEMES[self.scheme].is_broker
 
     @property
+    def is_zeromq(self) -> bool:
+        """Whether it is an endpoint of ZeroMQ."""
+        return SCHEMES[self.scheme].is_zeromq
+
+    @property
     def endpoint(self) -> str:
-        """The endpoint of a ZeroMQ address, without ``bind:`` and ``connect:``."""
+        """The endpoint of a ZeroMQ address, without ``bind:`` and ``connect:``; otherwise the address as text."""
+        if not self.is_zeromq:
+            return str(self)
         return self.name.partition(":")[2] if self.binds is not None else self.name
 
     @property
@@ -206,12 +255,13 @@ def parse_address(address: str | Address) -> Address:
     address
         Of RabbitMQ (``amqp``, encrypted ``amqps``), NATS (``nats``, encrypted ``tls``), MQTT (``mqtt``, encrypted
         ``mqtts``), ZeroMQ (``tcp``, ``ipc``, ``inproc``; with ``connect:`` before it the publisher connects, with
-        ``bind:`` the subscriber binds) or a broker within this process, for tests (``memory``). An Address is returned
-        as it is.
+        ``bind:`` the subscriber binds), DDS (``dds``), Zenoh (``zenoh``) or a broker within this process, for tests
+        (``memory``). An Address is returned as it is.
 
         The options, each an attribute of `Address`: ``create=true``, ``attempts=3``, ``dead=NAME``, ``group=NAME``,
-        ``kind=queue`` (or ``broadcast``, ``log``), ``vhost=NAME``, ``ca=FILE``, ``password_file=FILE``. Between two of
-        them is an ``&``, which a shell takes for its own: quote the address there.
+        ``kind=queue`` (or ``broadcast``, ``log``), ``vhost=NAME``, ``ca=FILE``, ``password_file=FILE``. DDS and Zenoh
+        have others, which `epypes.transport.peers` lists. Between two of them is an ``&``, which a shell takes for its
+        own: quote the address there.
 
     Raises
     ------
@@ -239,13 +289,19 @@ def parse_address(address: str | Address) -> Address:
 
     >>> parse_address("mqtt://127.0.0.1/camera/1?kind=broadcast").kind
     'broadcast'
+
+    A topic of ROS 2 over DDS, in domain 0:
+
+    >>> address = parse_address("dds://0/rt/image?type=sensor_msgs/msg/Image&history=5")
+    >>> address.name, address.options["type"]
+    ('rt/image', 'sensor_msgs/msg/Image')
     """
     if isinstance(address, Address):
         return address
     scheme, found, _ = address.partition("://") if isinstance(address, str) else (type(address).__name__, "", "")
     side, _, plain = scheme.rpartition(":")
     known = SCHEMES.get(plain)
-    if found and known is not None and not known.is_broker and side in ("", *_SIDES):
+    if found and known is not None and known.is_zeromq and side in ("", *_SIDES):
         return Address(plain, address.partition("://")[2].rpartition(":")[0], 0, address, kind="broadcast")
     if not found or scheme not in SCHEMES:
         # What comes behind it may be a password.
@@ -254,8 +310,11 @@ def parse_address(address: str | Address) -> Address:
     parts = _split(scheme, address)
     options = _options(scheme, parts.query)
     name, port = unquote(parts.path.removeprefix("/")), parts.port
+    if scheme == "dds" and not parts.hostname:
+        right = f"dds://0{parts.path if name else '/rt/image'}{parts.query and f'?{parts.query}'}"
+        raise AddressError(scheme, f"An address of dds has no domain: write {right}")
     if not parts.hostname or not name:
-        missing = "host" if not parts.hostname else "name behind the host: a queue, subject or topic"
+        missing = "host" if not parts.hostname else "name behind the host: a queue, subject, topic or key"
         raise AddressError(scheme, f"An address of {scheme} has no {missing}. {_FORM}")
     if _CONTROL.search(name):
         raise AddressError(scheme, f"The name in an address of {scheme} has control characters in it: {name!r}.")
@@ -283,9 +342,10 @@ def _split(scheme: str, address: str) -> SplitResult:
 
 def _options(scheme: str, query: str) -> dict[str, str]:
     options = dict(parse_qsl(query, keep_blank_values=True))
-    unknown = sorted(set(options) - set(_OPTIONS))
+    known = SCHEMES[scheme].options
+    unknown = sorted(set(options) - set(known))
     if unknown:
-        text = f"An address of {scheme} has no option {', '.join(unknown)}. There are: {', '.join(_OPTIONS)}."
+        text = f"An address of {scheme} has no option {', '.join(unknown)}. There are: {', '.join(known)}."
         raise AddressError(scheme, text)
     return options
 
@@ -305,7 +365,27 @@ def _with_options(bare: Address, options: Mapping[str, str]) -> Address:
         changes["attempts"] = int(options["attempts"])
     if options.get("password_file"):
         changes["password"] = _read_password(bare, Path(options["password_file"]))
+    if not bare.is_broker:
+        for name, value in options.items():
+            _check_option(bare, name, value)
+        own = {name: changes.pop(name) for name in options if name not in _OPTIONS}
+        changes |= {"kind": "broadcast", "options": own}
     return replace(bare, **changes)  # type: ignore[arg-type]  # each was checked above
+
+
+def _check_option(bare: Address, name: str, value: str) -> None:
+    """Raise AddressError for an option of DDS or Zenoh that has no such value."""
+    if name in _WORDS and value not in _WORDS[name]:
+        wanted = f"one of {', '.join(_WORDS[name])}"
+    elif name in _WHOLE_NUMBERS and not (value.isascii() and value.isdecimal()):
+        wanted = "a whole number"
+    elif name in _SECONDS and not re.fullmatch(r"\d{1,9}(\.\d{1,9})?", value, re.ASCII):
+        wanted = "a number of seconds"
+    elif name == "type" and not re.fullmatch(r"\w+(/\w+)*", value, re.ASCII):
+        wanted = "the name of a type, as sensor_msgs/msg/Image"
+    else:
+        return
+    raise AddressError(str(bare), f"{name} is {wanted}, not {value!r}, in {bare}.")
 
 
 def _read_password(bare: Address, path: Path) -> str:
@@ -337,7 +417,12 @@ def open_channel(address: str | Address, options: ChannelOptions | None = None) 
     except ModuleNotFoundError as error:
         if error.name is not None and error.name.startswith("epypes"):
             raise
-        text = f"{parsed} needs {error.name}, which is not installed: {install_command(parsed.extra)}."
+        package = (error.name or "").partition(".")[0]
+        first_without = NO_WHEEL_FROM.get(package)
+        text = f"{parsed} needs {package}, which is not installed: {install_command(parsed.extra)}."
+        if first_without is not None and sys.version_info >= first_without:
+            this, before = (".".join(map(str, version)) for version in (sys.version_info[:2], first_without))
+            text = f"{parsed} needs {package}, which has no wheel for Python {this}. Use a version before {before}."
         raise AddressError(str(parsed), text) from error
     made: Channel = module.make_channel(parsed, options or ChannelOptions())
     return made

@@ -1,4 +1,4 @@
-"""The interface between EPypes and what carries its messages: ZeroMQ, a broker, or this process.
+"""The interface between EPypes and what carries its messages: ZeroMQ, a broker, DDS, Zenoh, or this process.
 
 `Subscriber` and `Publisher` are written on it once, for every scheme. A channel is opened either for sending or for
 receiving. It reconnects by itself until it is closed: what it has accepted for sending stays in order, under one id,
@@ -120,12 +120,15 @@ class ChannelOptions:
         Larger messages are refused.
     on_connection
         None, or called when the broker is connected or lost.
+    on_stale
+        None, or called when the input becomes stale, and when something is heard again (DDS, Zenoh).
     """
 
     prefetch: int = 8
     timeout_s: float = 10.0
     max_message_bytes: int = Limits().total_bytes
     on_connection: ConnectionListener | None = None
+    on_stale: Callable[[bool], object] | None = None
 
 
 class Channel(Protocol):

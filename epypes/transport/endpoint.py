@@ -22,6 +22,7 @@ from epypes.transport.address import Address, open_channel, parse_address
 from epypes.transport.channel import Channel, ChannelOptions
 
 if TYPE_CHECKING:
+    from epypes.transport.peers.channel import PeerChannel
     from epypes.transport.zeromq.channel import ZeroMQChannel
     from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
 
@@ -62,7 +63,8 @@ class Endpoint(OldNames, Startable):
         The parsed address.
     on_connection
         None, or called with whether the broker is connected, and why not, when that changes; on the thread of the
-        channel, and at the start perhaps on the caller's. It is not called for ZeroMQ, which connects by itself.
+        channel, and at the start perhaps on the caller's. It is not called for ZeroMQ, which connects by itself. For
+        DDS and Zenoh it says whether their session is open and, with a router, whether that is connected.
     """
 
     takes_brokers: ClassVar[bool] = True
@@ -90,7 +92,7 @@ class Endpoint(OldNames, Startable):
         self._reconnects = 0
         self._finalizer: weakref.finalize[Any, Any] | None = None
         self._security: CurveOptions | None = None
-        if not self.place.is_broker:
+        if self.place.is_zeromq:
             with optional_import():
                 from epypes.transport.zeromq.curve import CurveOptions
             self._given = self.place.endpoint
@@ -105,7 +107,8 @@ class Endpoint(OldNames, Startable):
                 )
                 raise AddressError(self._given, text)
             if keys is not None or allow is not None:
-                text = f"{self._given} takes no keys= and allow=, which are for ZeroMQ. Write the encrypted scheme."
+                text = f"{self._given} takes no keys= and allow=, which are for ZeroMQ."
+                text += " Write the encrypted scheme." if self.place.is_broker else ""
                 raise AddressError(self._given, text)
 
     @property
@@ -149,14 +152,19 @@ class Endpoint(OldNames, Startable):
         return self._channel if self._process == os.getpid() else None
 
     @property
-    def _zeromq_channel(self) -> ZeroMQChannel | None:
-        return None if self._security is None else self._channel  # type: ignore[return-value]
+    def _peer_channel(self) -> ZeroMQChannel | PeerChannel | None:
+        """The channel of ZeroMQ, DDS or Zenoh, which knows its peers; None for a broker."""
+        return None if self.place.is_broker else self._channel  # type: ignore[return-value]
 
-    def _new_channel(self, prefetch: int, **zeromq_options: Any) -> Channel:
-        """Return a channel that is not open; of a broker, the options of ZeroMQ have no meaning."""
+    def _new_channel(
+        self, prefetch: int, on_stale: Callable[[bool], object] | None = None, **zeromq_options: Any
+    ) -> Channel:
+        """Return a channel that is not open; the options of ZeroMQ have no meaning for any other."""
         if self._security is not None:
             from epypes.transport.zeromq.channel import ZeroMQChannel
 
+            if on_stale is not None:
+                zeromq_options["on_stale"] = on_stale
             return ZeroMQChannel(
                 self._given, self._security, max_message_bytes=self._max_message_bytes, **zeromq_options
             )
@@ -165,6 +173,7 @@ class Endpoint(OldNames, Startable):
             timeout_s=self._timeout_s,
             max_message_bytes=self._max_message_bytes,
             on_connection=weakly(self._connection_changed),
+            on_stale=on_stale,
         )
         return open_channel(self.place, options)
 

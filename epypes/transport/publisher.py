@@ -1,4 +1,4 @@
-"""Publishers: what is put into a queue is sent to an address, over ZeroMQ or to a broker."""
+"""Publishers: what is put into a queue is sent to an address, from peer to peer or to a broker."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class TakeQueue(Protocol):
 
 
 class Publisher(Endpoint):
-    """Sends what is put into a queue to an address, of ZeroMQ or of a broker.
+    """Sends what is put into a queue to an address: of ZeroMQ, a broker, DDS or Zenoh.
 
     Parameters
     ----------
@@ -126,7 +126,11 @@ class Publisher(Endpoint):
         self._queue, self._high_water_mark = queue, high_water_mark
         self._slow_subscribers = 0
         self._outbox = Outbox(
-            str(self.place), topic, Limits(total_bytes=max_message_bytes), self.place.is_broker, self._callback_threads
+            str(self.place),
+            topic,
+            Limits(total_bytes=max_message_bytes),
+            not self.place.is_zeromq,
+            self._callback_threads,
         )
         # The thread that takes from a queue which is no Mailbox, and what has a Mailbox keep its items again.
         self._bridge: threading.Thread | None = None
@@ -134,7 +138,7 @@ class Publisher(Endpoint):
 
     @property
     def sent(self) -> int:
-        """How many messages were handed to ZeroMQ, or confirmed by the broker."""
+        """How many messages were handed to ZeroMQ, DDS or Zenoh, or confirmed by the broker."""
         return self._outbox.sent
 
     @property
@@ -155,7 +159,7 @@ class Publisher(Endpoint):
         ZeroMQ does not report how many more it dropped for that subscriber until half of its queue had been sent; the
         subscriber's ``lost`` does.
         """
-        channel = self._zeromq_channel
+        channel = self._peer_channel
         return self._slow_subscribers + (0 if channel is None else channel.slow_subscribers)
 
     def start(self) -> Self:
@@ -253,12 +257,13 @@ class Publisher(Endpoint):
         item
             What could be put into the queue.
         id
-            The id of the message; without one, that of the envelope, or a new one. ZeroMQ does not carry it.
+            The id of the message; without one, that of the envelope, or a new one. ZeroMQ does not carry it, and
+            neither do messages of ROS 2.
         headers
-            Text that goes beside it, by name. ZeroMQ does not carry it.
+            Text that goes beside it, by name. Likewise.
         confirmed
-            Called once if the item was accepted: with None when the broker has confirmed the message (ZeroMQ: at once),
-            else with the error; on a thread of the channel or the caller's. It must be quick.
+            Called once if the item was accepted: with None when the broker has confirmed the message (without a broker:
+            at once), else with the error; on a thread of the channel or the caller's. It must be quick.
 
         Raises
         ------
@@ -270,13 +275,13 @@ class Publisher(Endpoint):
         self._outbox.send(item, id, headers, confirmed)
 
     def wait_for_subscriber(self, timeout_s: float = 5.0) -> bool:
-        """Return whether a ZeroMQ subscriber, of any topic, is connected within ``timeout_s`` seconds.
+        """Return whether a subscriber is connected within ``timeout_s`` seconds; over ZeroMQ, one of any topic.
 
         A broker keeps messages, so that there the connection is enough.
         """
-        if self._security is None:
+        if self.place.is_broker:
             return self.wait_connected(timeout_s)
-        channel = self._zeromq_channel
+        channel = self._peer_channel
         return channel is not None and channel.subscriptions.wait(timeout_s)
 
     def __repr__(self) -> str:
@@ -302,8 +307,8 @@ class Outbox:
         Of the envelopes.
     limits
         Larger messages are rejected.
-    is_broker
-        Whether a message counts as sent when a broker has confirmed it.
+    is_confirmed
+        Whether a message has an id, and counts as sent when the channel has confirmed it; not over ZeroMQ.
     callback_threads
         The threads that must not wait for a confirmation.
 
@@ -314,10 +319,10 @@ class Outbox:
         sets it, in any thread, where a lock could be held already.
     """
 
-    def __init__(self, name: str, topic: str, limits: Limits, is_broker: bool, callback_threads: set[int]) -> None:
+    def __init__(self, name: str, topic: str, limits: Limits, is_confirmed: bool, callback_threads: set[int]) -> None:
         self._name, self._topic, self._limits = name, topic, limits
         self._topic_frame = topic_frame(topic)
-        self._is_broker, self._callback_threads = is_broker, callback_threads
+        self._is_confirmed, self._callback_threads = is_confirmed, callback_threads
         self.sent = 0
         self.rejected: Counter[str] = Counter()
         self.is_stopping, self.until_s = True, 0.0
@@ -341,11 +346,11 @@ class Outbox:
     def take(self, item: Any) -> None:
         """Send an item of the queue.
 
-        To a broker, this waits until it is confirmed, and raises the error if it can't be sent. Else, and on a thread
-        that must not wait, what can't be sent is counted and logged.
+        Over a channel that confirms, this waits for that, and raises the error if it can't be sent. Else, and on a
+        thread that must not wait, what can't be sent is counted and logged.
         """
         me = threading.get_ident()
-        if not self._is_broker or me in self._callback_threads:
+        if not self._is_confirmed or me in self._callback_threads:
             try:  # noqa: SIM105 - each call costs 3 to 5 us here, after an image has filled the caches
                 self.send(item)
             except Exception:  # noqa: S110 - it is counted
@@ -408,7 +413,7 @@ class Outbox:
                 self._is_sending = True
                 try:
                     frames, source = self._frames(item)
-                    if self._is_broker:
+                    if self._is_confirmed:
                         known_as = id or (item.id if isinstance(item, Envelope | EncodedEnvelope) else "") or new_id()
                         channel.send(frames, id=known_as, headers=headers, confirmed=self._counting(confirmed))
                     else:
@@ -427,7 +432,7 @@ class Outbox:
         except BaseException as error:
             self._count_rejected(error, item)
             raise
-        if not self._is_broker:
+        if not self._is_confirmed:
             confirm(confirmed, None)
 
     def _counting(self, confirmed: Confirmed | None) -> Confirmed:

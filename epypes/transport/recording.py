@@ -16,12 +16,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
-from epypes.errors import BrokerError, InvalidValue, RecordingError, StillRunning
-from epypes.transport.address import parse_address
+from epypes.errors import AddressError, BrokerError, InvalidValue, RecordingError, StillRunning
+from epypes.transport.address import open_channel, parse_address
 from epypes.transport.channel import Delivery, Frames
 from epypes.transport.endpoint import Startable, warn_left_running
 from epypes.transport.mcap import BrokenOff, Recorded, RecordingCounts, RecordingWriter, messages
-from epypes.transport.subscriber import ZMQSubscriber
+from epypes.transport.peers.channel import PeerChannel
+from epypes.transport.subscriber import Subscriber, ZMQSubscriber
 from epypes.transport.zeromq.channel import ZeroMQChannel
 from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
 
@@ -107,11 +108,11 @@ class Recorder(Startable):
     Parameters
     ----------
     address
-        Where the publisher is: ``"tcp://127.0.0.1:5555"``.
+        Where the publisher is: ``"tcp://127.0.0.1:5555"``; or of DDS or Zenoh, but not of a broker.
     path
         The file, usually ``something.mcap``.
     topic
-        As for `ZMQSubscriber`; ``""`` records everything.
+        As for `Subscriber`; ``""`` records everything.
     bind
         True to bind, for publishers that connect.
     force
@@ -124,12 +125,12 @@ class Recorder(Startable):
         Called on the recorder's thread when the file is closed: it has that number of messages, or the disk failed,
         or the recorder was stopped.
     **options
-        For the `ZMQSubscriber`: ``insecure``, ``keys``, ``allow``, ``max_message_bytes``, ``high_water_mark``.
+        For the `Subscriber`: ``insecure``, ``keys``, ``allow``, ``max_message_bytes``, ``high_water_mark``.
 
     Raises
     ------
     AddressError, MessageError
-        As from `ZMQSubscriber`.
+        As from `Subscriber`.
 
     Notes
     -----
@@ -151,11 +152,14 @@ class Recorder(Startable):
         **options: Any,
     ) -> None:
         self.path = Path(path)
-        about = {"address": parse_address(address).endpoint, "topic": topic}
+        parsed = parse_address(address)
+        about = {"address": parsed.endpoint, "topic": topic}
+        # The one for ZeroMQ alone refuses a broker: a recording would take messages from other consumers.
+        kind = ZMQSubscriber if parsed.is_broker else Subscriber
 
-        def make() -> tuple[ZMQSubscriber, _Recording]:
+        def make() -> tuple[Subscriber, _Recording]:
             recording = _Recording(self.path, about, force, messages, backlog_bytes, on_end)
-            return ZMQSubscriber(address, recording, topic, bind, undecoded=True, **options), recording
+            return kind(parsed, recording, topic, bind, undecoded=True, **options), recording
 
         self._make = make
         # Made at once, so that the constructor refuses wrong arguments. They are two objects, so that the recorder's
@@ -229,7 +233,7 @@ class Recorder(Startable):
         return self._recording.ended.wait(timeout_s)
 
     def wait_joined(self, timeout_s: float = 5.0, publishers: int = 1) -> bool:
-        """Return whether publishers have confirmed: all they send from then on is recorded. See `ZMQSubscriber`."""
+        """Return whether publishers have confirmed: all they send from then on is recorded. See `Subscriber`."""
         return self._subscriber.wait_joined(timeout_s, publishers)
 
     def __repr__(self) -> str:
@@ -355,9 +359,9 @@ class Player(Startable):
     path
         The file.
     address
-        ``"tcp://127.0.0.1:*"`` takes a free port, which `address` then names.
+        ``"tcp://127.0.0.1:*"`` takes a free port, which `address` then names; or of DDS or Zenoh.
     bind
-        False to connect to a subscriber that binds.
+        False to connect to a ZeroMQ subscriber that binds.
     speed
         2.0 plays twice as fast; 0 as fast as subscribers take it.
     loop
@@ -382,8 +386,9 @@ class Player(Startable):
 
     Notes
     -----
-    Start it, or use ``with``. Unlike a publisher it drops nothing: a file can wait for a subscriber that does not keep
-    up, which delays the messages behind it. Envelopes keep their ids, epochs, sequence numbers and times.
+    Start it, or use ``with``. Unlike a publisher it drops nothing over ZeroMQ, nor over Zenoh with `congestion=block`:
+    a file can wait for a subscriber that does not keep up, which delays the messages behind it. Envelopes keep their
+    ids, epochs, sequence numbers and times.
     """
 
     def __init__(
@@ -406,12 +411,21 @@ class Player(Startable):
             raise InvalidValue(f"loop is {loop}; give how often, or 0 for without end.")
         parsed = parse_address(address)
         self._given = parsed.endpoint
-        binds = bind if parsed.binds is None else parsed.binds
-        self._security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
         self.path = Path(path)
+        if parsed.is_zeromq:
+            binds = bind if parsed.binds is None else parsed.binds
+            security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
+        elif parsed.is_broker:
+            raise AddressError(
+                self._given, f"{self._given} is an address of a broker, to which no recording is played."
+            )
 
         def make() -> _Playback:
-            channel = ZeroMQChannel(self._given, self._security, high_water_mark=_HIGH_WATER_MARK)
+            channel: ZeroMQChannel | PeerChannel
+            if parsed.is_zeromq:
+                channel = ZeroMQChannel(self._given, security, high_water_mark=_HIGH_WATER_MARK)
+            else:
+                channel = open_channel(parsed)  # type: ignore[assignment]  # that of a peer, as checked above
             return _Playback(self.path, channel, speed, loop, wait, on_end)
 
         self._make = make
@@ -427,7 +441,7 @@ class Player(Startable):
 
     @property
     def sent(self) -> int:
-        """How many messages were handed to ZeroMQ since the start."""
+        """How many messages were handed over since the start."""
         playing = self._playing
         return 0 if playing is None else playing.sent
 
@@ -490,7 +504,13 @@ class _Playback(_FileThread):
     """One playing from its start to its stop: the channel, and the thread that sends."""
 
     def __init__(
-        self, path: Path, channel: ZeroMQChannel, speed: float, loop: int, wait: bool, on_end: Callable[[], None]
+        self,
+        path: Path,
+        channel: ZeroMQChannel | PeerChannel,
+        speed: float,
+        loop: int,
+        wait: bool,
+        on_end: Callable[[], None],
     ) -> None:
         super().__init__("Player", "read", path, on_end)
         self.channel = channel

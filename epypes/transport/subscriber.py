@@ -1,4 +1,4 @@
-"""Subscribers: what arrives at an address, over ZeroMQ or from a broker, is put into a queue."""
+"""Subscribers: what arrives at an address, from a peer or from a broker, is put into a queue."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class PutQueue(Protocol):
 
 
 class Subscriber(Endpoint):
-    """Puts the messages of an address, of ZeroMQ or of a broker, into a queue.
+    """Puts the messages of an address into a queue: of ZeroMQ, a broker, DDS or Zenoh.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ class Subscriber(Endpoint):
         Any object with ``put(item, block=False)``, as queue.Queue and ep.Mailbox have it. A message of one frame is put
         as bytes (2019 mode), one of more frames as an Envelope, whose arrays are read-only. From a broker both have
         ``ack()``, ``reject(reason)``, ``nack()`` and ``attempt``. From ZeroMQ it is called on the I/O thread, and must
-        be quick; what a full queue does not take is dropped and counted. From a broker it is called on a thread of the
-        channel, and a full queue is waited for.
+        be quick; otherwise it is called on a thread of the channel. What a full queue does not take is dropped and
+        counted; with a broker it is waited for.
     topic
         Topic of the envelopes: ``"cam1"`` gets ``cam1`` and ``cam1/left``, not ``cam10``; ``""`` gets everything.
         Messages of 2019 have no topic: with one given, only those come whose own bytes begin with it and a slash. At a
@@ -89,7 +89,7 @@ class Subscriber(Endpoint):
     ordered
         True to put envelopes in the order of their sequence numbers, by source and epoch; answers in the order of the
         requests that they answer, also those of several replicas of a service. What comes too early waits for what is
-        missing: for 1 s over ZeroMQ, for 10 s from a broker, or for the number of seconds that is given in place of
+        missing: for 1 s, from a broker for 10 s, or for the number of seconds that is given in place of
         True. A line in the log then names what is missing. What waits is unacknowledged: ``prefetch`` bounds how far
         apart the messages of a broker may come.
     insecure
@@ -118,7 +118,7 @@ class Subscriber(Endpoint):
     ----------
     on_stale
         None, or called with True when the input becomes stale and with False when something is heard again. It is
-        called on the I/O thread, and must be quick.
+        called on the I/O thread of ZeroMQ or a thread of the channel, and must be quick.
 
     Raises
     ------
@@ -204,7 +204,7 @@ class Subscriber(Endpoint):
 
     @property
     def lost(self) -> Mapping[Source, int]:
-        """How many envelopes never arrived over ZeroMQ, by (source, epoch): gaps in their numbers; a copy."""
+        """How many envelopes never arrived from a peer, by (source, epoch): gaps in their numbers; a copy."""
         return dict(self._inbox.losses.lost)
 
     @property
@@ -219,14 +219,14 @@ class Subscriber(Endpoint):
 
     @property
     def is_stale(self) -> bool:
-        """Whether a ZeroMQ publisher that had joined is silent: it does not even answer. One that is idle does."""
-        channel = self._zeromq_channel
+        """Whether the publishers that had joined are gone or silent; one that is idle is not. False with a broker."""
+        channel = self._peer_channel
         return channel is not None and channel.publishers.is_stale
 
     @property
     def last_heard_s(self) -> float | None:
-        """How many seconds ago anything came from a ZeroMQ publisher; None before that, and when it is stopped."""
-        channel = self._zeromq_channel
+        """How many seconds ago anything came from a publisher; None before that, with a broker, and when stopped."""
+        channel = self._peer_channel
         return None if channel is None else channel.publishers.last_heard_s
 
     def start(self) -> Self:
@@ -290,7 +290,7 @@ class Subscriber(Endpoint):
     def pause(self) -> None:
         """Take no further messages from the broker and stay connected: messages can be acknowledged.
 
-        What arrives over ZeroMQ meanwhile is dropped.
+        What arrives from peers meanwhile is dropped.
         """
         if self._channel is not None:
             self._channel.pause()
@@ -308,12 +308,13 @@ class Subscriber(Endpoint):
         timeout_s
             Longest wait, in seconds.
         publishers
-            How many ZeroMQ publishers must have confirmed it since the start. Only those of EPypes 1.0 do; one of 2019
-            never will. A broker keeps messages, so that there the connection is enough.
+            How many publishers must have confirmed it: of ZeroMQ since the start, of DDS and Zenoh those that are
+            there. A ZeroMQ publisher of 2019 never will. A broker keeps messages, so that there the connection is
+            enough.
         """
-        if self._security is None:
+        if self.place.is_broker:
             return self.wait_connected(timeout_s)
-        channel = self._zeromq_channel
+        channel = self._peer_channel
         return channel is not None and channel.publishers.wait(timeout_s, publishers)
 
     def _report_stale(self, is_stale: bool) -> None:
@@ -365,7 +366,7 @@ class Inbox:
     ) -> None:
         self._queue, self._topic, self._address, self._limits = queue, topic, address, limits
         self._acknowledge, self._exhausted, self._undecoded = acknowledge, exhausted, undecoded
-        self._is_zeromq = not address.is_broker
+        self._is_zeromq = address.is_zeromq
         self._ordering = ReorderBuffer(_hold_s(ordered, address)) if ordered else None
         self._timer: threading.Timer | None = None
         self.is_over = True
@@ -474,7 +475,7 @@ class Inbox:
             self._put_all(self._ordering, self._ordering.add(*place_in_order(envelope), (item, delivery)))
 
     def _is_wanted(self, delivery: Delivery) -> bool:
-        """Check what a broker has delivered; return False if it is of another topic and not kept by a queue."""
+        """Check a delivery, unless ZeroMQ has; return False if it is of another topic and not kept by a queue."""
         frames = delivery.frames
         size = sum(map(len, frames))
         if size > self._limits.total_bytes:
@@ -557,12 +558,12 @@ class Inbox:
             try:
                 self._queue.put(item, block=False)
             except queues.Full:
-                if self._is_zeromq:
+                if not self._address.is_broker:
                     raise
                 self._put_when_there_is_room(item)
         except queues.Full:
             self.received -= 1
-            if self._is_zeromq:
+            if not self._address.is_broker:
                 self.dropped["queue full"] += 1
             delivery.nack()
         except BaseException as error:

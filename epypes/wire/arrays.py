@@ -234,19 +234,49 @@ def read_image(reader: ValueReader, message: Any, path: Path) -> AnyArray:
             "bad encoding", f"{format_path(path)} has encoding {encoding[:40]!r}; known are {', '.join(ENCODINGS)}."
         )
     channels, dtype_text = ENCODINGS[encoding]
-    dtype = np.dtype(dtype_text)
-    row = row_bytes(width, encoding)
-    if row == 0 or height == 0 or step < row:
-        text = f"{format_path(path)} is {width} x {height} {encoding} with step {step}; a row takes {row} bytes."
-        raise MessageError("bad step", text)
-    if step * height != data.nbytes:
-        text = f"{format_path(path)} has {data.nbytes} bytes, but {height} rows of {step} take {step * height}."
-        raise MessageError("size differs", text)
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    strides = (step, channels * dtype.itemsize, dtype.itemsize)[: len(shape)]
-    image = freeze(np.ndarray(shape, dtype, buffer=data, strides=strides))
+    image = view_rows(data, (height, width), channels, np.dtype(dtype_text), step, f"{format_path(path)}, {encoding},")
     if channels == 1:
         return image
     order: Order = "rgb" if encoding.startswith("rgb") else "bgr"
     reader.order = reader.order or order
     return image if order == reader.order else freeze(swapped(image))
+
+
+def view_rows(
+    data: memoryview, size: tuple[int, int], channels: int, dtype: np.dtype[Any], step: int, where: str
+) -> AnyArray:
+    """Return an image, read-only, in the memory of its rows; a copy if that is not aligned.
+
+    Parameters
+    ----------
+    data
+        The rows.
+    size
+        Height and width, as a message describes them: they are checked here.
+    channels
+        With one channel the image is of shape (height, width).
+    dtype
+        Of a channel.
+    step
+        Bytes from one row to the next, as a message describes them.
+    where
+        What the image is, for the error.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"bad step"`` or ``"size differs"``.
+    """
+    import numpy as np
+
+    height, width = size
+    row = width * channels * dtype.itemsize
+    if row == 0 or height == 0 or step < row:
+        text = f"{where} is {width} x {height} pixels with step {step}; a row takes {row} bytes."
+        raise MessageError("bad step", text)
+    if step * height != data.nbytes:
+        text = f"{where} has {data.nbytes} bytes, but {height} rows of {step} take {step * height}."
+        raise MessageError("size differs", text)
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    strides = (step, channels * dtype.itemsize, dtype.itemsize)[: len(shape)]
+    return freeze(np.ndarray(shape, dtype, buffer=data, strides=strides))

@@ -102,9 +102,14 @@ def _raw_image(content: Any, data: memoryview) -> Any:
     return message_class("foxglove.RawImage")(**fields)
 
 
-def _compressed_image(data: memoryview) -> Any:
+def image_file_format(data: bytes | memoryview) -> str:
+    """Return ``"jpeg"``, ``"png"`` or ``"webp"``, by the first bytes of a file; empty for any other."""
     start = bytes(data[:12])
-    found = next((name for sign, name in _FILE_STARTS.items() if start.startswith(sign)), "")
     if start[:4] == b"RIFF" and start[8:] == b"WEBP":
-        found = "webp"
+        return "webp"
+    return next((name for sign, name in _FILE_STARTS.items() if start.startswith(sign)), "")
+
+
+def _compressed_image(data: memoryview) -> Any:
+    found = image_file_format(data)
     return message_class("foxglove.CompressedImage")(format=found) if found else None

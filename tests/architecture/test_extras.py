@@ -189,9 +189,10 @@ images, found = queue.SimpleQueue(), queue.SimpleQueue()
 image = np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3)
 frame = Envelope("frame", {"image": image}, rgb=["image"])
 with (
-    ep.Subscriber(sys.argv[1], found, acknowledge="received"),
-    ep.Publisher(sys.argv[1], images),
+    ep.Subscriber(sys.argv[1], found, acknowledge="received") as subscriber,
+    ep.Publisher(sys.argv[1], images) as publisher,
 ):
+    assert subscriber.wait_joined(60) and publisher.wait_for_subscriber(60)
     images.put(frame)
     event = found.get(timeout=60)
     assert np.array_equal(event.parts["image"], image)
@@ -347,6 +348,13 @@ def test_postgres_has_a_driver(environment):
 @pytest.mark.parametrize(("extra", "server"), [("rabbitmq", "rabbitmq"), ("nats", "nats"), ("mqtt", "mosquitto")])
 def test_a_broker_carries_envelopes(extra, server, environment, request):
     address = request.getfixturevalue(server).address("events", create="true")
+    assert environment(extra).python(BROKER, address) == "arrived\n"
+
+
+@pytest.mark.parametrize(
+    ("extra", "address"), [("dds", "dds://7/extras"), ("zenoh", "zenoh://127.0.0.1/epypes/extras")]
+)
+def test_a_middleware_without_a_broker_carries_envelopes(extra, address, environment):
     assert environment(extra).python(BROKER, address) == "arrived\n"
 
 

@@ -43,7 +43,9 @@ def test_every_cell_runs_and_every_graph_is_drawn(lab_page: Any, name: str) -> N
 
 
 @pytest.mark.parametrize(
-    "tutorial", [path for path in TUTORIALS[1:] if path.stem not in RUN], ids=lambda path: path.stem
+    "tutorial",
+    [path for path in TUTORIALS[1:] if path.stem not in RUN and "epypes-figure" in path.read_text()],
+    ids=lambda path: path.stem,
 )
 def test_every_graph_that_is_saved_in_a_tutorial_is_drawn_when_it_is_opened(
     lab_page: Any, lab: JupyterLab, tutorial: Path

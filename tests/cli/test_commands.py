@@ -13,6 +13,7 @@ import epypes as ep
 from epypes.acquisition import read_image, write_image
 from epypes.bundle.load import read_bundle
 from epypes.bundle.manifest import write_manifest
+from epypes.bundle.proof.replay import ReplayReport
 from epypes.cli import main
 from epypes.cli.app import app
 from epypes.service import Service
@@ -84,6 +85,19 @@ def test_calling_where_nothing_serves_is_one_line(epypes, bundle, photograph, tm
     write_image(tmp_path / "photo.png", photograph)
     said = one_line(epypes("call", bundle.path, tmp_path / "photo.png", "--out", "x.png"))
     assert "No service runs for" in said
+
+
+def test_verify_never_prints_the_password_of_a_running_service(tmp_path, monkeypatch, capsys):
+    addresses = [f"amqp://me:secret@127.0.0.1/{queue}" for queue in ("events", "answers")]
+    monkeypatch.setattr("epypes.service.verify_service", lambda path, *addresses, **options: ReplayReport(1, 1, ()))
+    with pytest.raises(SystemExit):
+        main(["verify", str(tmp_path), "--against", ",".join(addresses)])
+    with pytest.raises(SystemExit) as failed:
+        main(["verify", str(tmp_path), "--against", addresses[0]])
+    printed = capsys.readouterr()
+    assert "by the service at amqp://me@127.0.0.1:5672/events,amqp://me@127.0.0.1:5672/answers" in printed.out
+    assert "Give both: --against EVENTS,ANSWERS" in f"{failed.value.code}{printed.err}"
+    assert "secret" not in f"{failed.value.code}{printed.out}{printed.err}"
 
 
 @pytest.mark.slow

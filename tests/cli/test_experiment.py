@@ -33,7 +33,7 @@ def test_one_command_runs_the_experiment_prints_its_times_and_leaves_figures(epy
     folder = tmp_path / "new" / "folder"
     done = epypes("experiment", "--layout", "one", "--requests", 4, "--experiments", 2, *cameras, "--out", folder)
     assert done.returncode == 0, done.stderr
-    for words in ("Layout one, in milliseconds", "paper's mode", "t_trip", "o_network", "vision.o_epypes"):
+    for words in ("Layout one over zeromq, in milliseconds", "paper's mode", "t_trip", "o_network", "vision.o_epypes"):
         assert words in done.stdout
     assert len(pd.read_csv(folder / "requests.csv")) == 8
     assert {path.name for path in folder.iterdir()} == {
@@ -45,6 +45,21 @@ def test_one_command_runs_the_experiment_prints_its_times_and_leaves_figures(epy
     assert all("<svg" in path.read_text() for path in folder.glob("*.svg"))
     assert "Left in" in done.stdout
     assert done.stderr == "", "progress is for terminals"
+
+
+def test_transports_are_compared_in_one_table(epypes, cameras, tmp_path):
+    transports = [word for name in ("zeromq", "dds", "zenoh") for word in ("--transport", name)]
+    counts = ("--layout", "three", "--requests", 3, "--experiments", 1)
+    done = epypes("experiment", *transports, *counts, *cameras, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    title, heads, *rows = done.stdout.splitlines()[:5]
+    assert title == "Transports, in milliseconds, CPU of all processes"
+    assert " ".join(heads.split()) == "requests trip mode trip p99 network mode network p99 CPU per request"
+    for row, name in zip(rows, ("zeromq", "dds", "zenoh"), strict=True):
+        transport, requests, *times = row.split()
+        assert (transport, requests) == (name, "3")
+        assert all(0 < float(time) < 1e3 * TIMEOUT_S for time in times)
+        assert pd.read_csv(tmp_path / name / "requests.csv")["t_trip"].gt(0).all()
 
 
 @pytest.mark.parametrize(

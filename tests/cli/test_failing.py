@@ -85,11 +85,13 @@ ROWS = {
     ],
     "failures": [(["{folder}/none"], "{folder}/none does not exist")],
     "replay": [(["latest", "{folder}/none"], "{folder}/none does not exist"), (["abc"], "No failure 'abc' here")],
+    "cameras": [],  # it lists what there is, and what is missing to look for more
     "keys": [(["a/b"], "is no name for keys")],
     "doctor": [(["{folder}"], "Not ready: bundle")],
     "export": [
         (["systemd", "{folder}/none"], "{folder}/none does not exist"),
         (["docker", "{broken}", "--to", "{folder}/image"], "pipeline.toml can't be read: "),
+        (["cpp", "{broken}", "--to", "{folder}/cpp"], "pipeline.toml can't be read: "),
     ],
     "record": [(["nonsense", "{folder}/a.mcap"], "'nonsense' is not the beginning of an address that EPypes knows")],
     "play": [

@@ -104,6 +104,8 @@ class Reader:
             assert done.returncode == (int(expected[1]) if expected else 0), done.stdout + done.stderr
         elif " nats-server " in line:
             self._start_broker(line)
+        elif words[0] in ("cmake", "ctest") or words[0].startswith("edges_cpp/"):
+            subprocess.run(words, check=True, capture_output=True)
         elif words[0] == "make":
             subprocess.run(["make", "-n", *words[1:]], cwd=ROOT, check=True, capture_output=True)
         else:

@@ -20,6 +20,7 @@ from epypes.experiment.run import Robot
 from epypes.pipeline import FullPipeline
 
 TIMEOUT_S = 60.0
+LOCAL = "tcp://127.0.0.1:*"
 IN_CHILDREN = pytest.mark.slow
 
 
@@ -139,7 +140,7 @@ def test_a_process_that_hangs_while_it_starts_ends_with_its_parent(end, tmp_path
     code = (
         "from epypes.experiment.layouts import ChildStation\n"
         "from epypes.experiment.nodes import Settings\n"
-        f"station = ChildStation(['acquisition'], Settings(({str(pipe)!r},) * 2), print)\n"
+        f"station = ChildStation(['acquisition'], Settings(({str(pipe)!r},) * 2), {LOCAL!r}, print)\n"
         "print(station.pid, flush=True); station.start('tcp://127.0.0.1:1')"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
@@ -186,7 +187,7 @@ def test_a_camera_that_cannot_be_opened_is_an_error_at_once_in_one_process(tmp_p
 @IN_CHILDREN
 def test_a_process_ends_before_it_was_started_and_twice(images):
     ended = []
-    station = ChildStation(["vision"], settings_of(images), ended.append)
+    station = ChildStation(["vision"], settings_of(images), LOCAL, ended.append)
     station.stop()
     station.stop()
     assert not children()
@@ -195,7 +196,7 @@ def test_a_process_ends_before_it_was_started_and_twice(images):
 
 @IN_CHILDREN
 def test_a_process_that_does_not_end_by_itself_is_killed(images):
-    station = ChildStation(["vision"], settings_of(images), lambda error: None)
+    station = ChildStation(["vision"], settings_of(images), LOCAL, lambda error: None)
     os.kill(station.pid, signal.SIGSTOP)
     start = time.monotonic()
     station.stop(timeout_s=0.2)

@@ -7,7 +7,7 @@ import math
 import pandas as pd
 import pytest
 
-from epypes.experiment.results import COLUMNS, Results, durations_of, row_of, table_of
+from epypes.experiment.results import COLUMNS, Results, comparison, durations_of, row_of, table_of
 from epypes.experiment.run import Answer
 
 # Clocks of three machines that know nothing of each other.
@@ -90,3 +90,21 @@ def test_a_table_comes_back_from_its_file(tmp_path):
 
 def test_a_table_of_no_rows_has_the_columns():
     assert tuple(table_of([])) == COLUMNS
+
+
+def test_experiments_are_added_and_transports_are_compared_by_trips_and_cpu():
+    def results(transport, trips_s, cpu_s):
+        rows = [row_of(Answer(f"{trip}", trip, TIMES), 0, number) for number, trip in enumerate(trips_s)]
+        rows.append(row_of(Answer("none", failure="no answer"), 0, len(rows)))
+        return Results("three", table_of(rows), {"late answer": 1}, transport, cpu_s)
+
+    both = results("zeromq", [20.0, 24.0], 3.0) + results("zeromq", [22.0], 1.0)
+    assert (both.layout, both.transport, both.cpu_s, both.counts) == ("three", "zeromq", 4.0, {"late answer": 2})
+    assert [*both.table["experiment"]] == [0, 0, 0, 1, 1]
+    table = comparison([both, results("zenoh", [21.0], 1.0)])
+    assert [*table.index] == ["zeromq", "zenoh"]
+    assert [*table["requests"]] == [3, 1]
+    assert table.loc["zeromq", "cpu_ms"] == pytest.approx(800.0)
+    assert 23_900 < table.loc["zeromq", "trip_p99_ms"] <= 24_000
+    assert table.loc["zenoh", "trip_mode_ms"] == pytest.approx(21_000.0)
+    assert table.loc["zenoh", "network_mode_ms"] == pytest.approx(2_000.0)

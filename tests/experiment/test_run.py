@@ -61,6 +61,7 @@ def test_pickled_contents_are_sent_and_read_when_they_are_asked_for(images):
         ({"layout": "papr"}, "There is no layout 'papr'. There are: paper, one, three."),
         ({"layout": 3}, "There is no layout 3. There are: paper, one, three."),
         ({"layout": ["one"]}, "There is no layout ['one']. There are: paper, one, three."),
+        ({"transport": "zmq"}, "There is no transport 'zmq'. There are: zeromq, dds, zenoh."),
         ({"requests": 0}, "requests must be a whole number from 1, not 0."),
         ({"requests": True}, "requests must be a whole number from 1, not True."),
         ({"experiments": -1}, "experiments must be a whole number from 1, not -1."),

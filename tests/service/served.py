@@ -95,8 +95,8 @@ def event(what="plain", number=1):
 class Peer:
     """Sends events to a service and gets its answers and failures."""
 
-    def __init__(self, requests, answers, failures):
-        self.requests, self.answers, self.failures = requests, answers, failures
+    def __init__(self, requests, answers, failures, publisher):
+        self.requests, self.answers, self.failures, self.publisher = requests, answers, failures, publisher
         self.sent = []
 
     def send(self, what="plain", number=1):
@@ -132,14 +132,14 @@ class Peer:
 def peer_at(sub, pub, failures):
     requests, answers, failed = queue.Queue(), queue.Queue(), queue.Queue()
     with (
-        ep.ZMQSubscriber(pub, answers) as answered,
-        ep.ZMQSubscriber(failures, failed, "failure") as reported,
-        ep.ZMQPublisher(sub, requests, bind=False) as publisher,
+        ep.Subscriber(pub, answers) as answered,
+        ep.Subscriber(failures, failed, "failure") as reported,
+        ep.Publisher(sub, requests, bind=False) as publisher,
     ):
         assert answered.wait_joined(TIMEOUT_S)
         assert reported.wait_joined(TIMEOUT_S)
         assert publisher.wait_for_subscriber(TIMEOUT_S)
-        yield Peer(requests, answers, failed)
+        yield Peer(requests, answers, failed, publisher)
 
 
 @contextmanager

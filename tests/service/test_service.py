@@ -203,6 +203,11 @@ def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
         assert service.service_state.sub == f"tcp://127.0.0.1:{port}"
 
 
+def test_one_of_two_addresses_that_is_missing_is_named(edge_bundle):
+    with pytest.raises(ServiceError, match=r"pub \(--pub\) is missing: give both addresses"):
+        Client(edge_bundle.path, sub="tcp://127.0.0.1:5555")
+
+
 @pytest.mark.slow
 def test_a_killed_service_is_an_error_at_once_and_is_not_taken_for_a_running_one(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:

@@ -6,7 +6,10 @@ import queue
 
 from epypes.transport.address import open_channel
 from epypes.transport.channel import ChannelOptions
+from epypes.transport.peers.channel import PeerChannel
 
+# The middleware without a broker that the tests of channels run on.
+PEERS = ("dds", "zenoh")
 WAIT_S = 60.0
 ABSENT_S = 0.3
 
@@ -55,3 +58,22 @@ class Receiver:
 def body(delivery):
     """Return the frames of a delivery as one text of bytes."""
     return b"|".join(bytes(frame) for frame in delivery.frames)
+
+
+class OfPeers:
+    """The addresses of a middleware without a broker, with the same method as the servers."""
+
+    def __init__(self, name):
+        self.name = name
+
+    def address(self, name, **options):
+        """Return an address; what concerns brokers is left out."""
+        return f"{'dds://7' if self.name == 'dds' else 'zenoh://127.0.0.1'}/{name}"
+
+
+def join(sender, *receivers):
+    """Wait until what is sent arrives, where there is no broker that keeps it."""
+    for receiver in receivers:
+        if isinstance(receiver.channel, PeerChannel):
+            assert receiver.channel.publishers.wait(WAIT_S)
+            assert sender.channel.subscriptions.wait(WAIT_S)

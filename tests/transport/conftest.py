@@ -9,6 +9,9 @@ import zmq
 
 from tests.transport.peers import WAIT_S
 
+# Programs of another environment.
+collect_ignore = ["ros_peer"]
+
 
 @pytest.fixture
 def opened():

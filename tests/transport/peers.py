@@ -16,7 +16,11 @@ WAIT_S = 60.0
 def threads() -> list[threading.Thread]:
     """Return the threads of this room that run; other rooms may have left some."""
     named = ("epypes-io", "epypes-guard", "epypes-publisher", "epypes-ordering", "epypes-decoding")
-    return [one for one in threading.enumerate() if one.name.startswith((*named, "epypes from", "epypes brokers"))]
+    return [
+        one
+        for one in threading.enumerate()
+        if one.name.startswith((*named, "epypes from", "epypes brokers", "epypes peer"))
+    ]
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float = WAIT_S) -> None:
@@ -58,6 +62,21 @@ with ZMQPublisher(sys.argv[1], out, "t") as pub:
         for _ in range(int(line)):
             number += 1
             out.put(Envelope("x", {"n": number}, source="peer"))
+"""
+
+# Likewise over any address without a broker; it prints "joined" when a subscriber is there.
+PEER_PUBLISHER = """
+import sys
+from epypes.transport import Publisher
+from epypes.wire import Envelope
+with Publisher(sys.argv[1], topic="t") as pub:
+    assert pub.wait_for_subscriber(60)
+    print("joined", flush=True)
+    number = 0
+    for line in sys.stdin:
+        for _ in range(int(line)):
+            number += 1
+            pub.send(Envelope("x", {"n": number}, source="peer"))
 """
 
 

@@ -139,6 +139,24 @@ def test_rejected_messages_go_beside_their_queue_or_where_the_address_says(text,
     assert parse_address(text).dead_letters.kind == "queue"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "dds://0/rt/image?type=sensor_msgs/msg/Image&history=5&reliability=best_effort",
+        "zenoh://127.0.0.1/line/*/edges?congestion=block",
+        "zenoh://robot@router.lab:7448/line?priority=data_high&ca=/etc/lab.pem&password_file={file}",
+    ],
+)
+def test_an_address_of_dds_or_zenoh_is_no_broker_and_its_text_is_read_as_the_same(text, tmp_path):
+    file = tmp_path / "password"
+    file.write_text("secret\n")
+    text = text.format(file=file)
+    address = parse_address(text)
+    assert (str(address), address.endpoint, parse_address(str(address))) == (text, text, address)
+    assert (address.kind, address.is_broker, address.is_zeromq, is_broker(text)) == ("broadcast", False, False, False)
+    assert "secret" not in f"{address} {address!r}"
+
+
 def test_an_address_of_zeromq_is_no_broker_and_is_kept_as_it_is():
     address = parse_address("connect:tcp://127.0.0.1:5555")
     assert (str(address), address.is_broker, address.kind) == ("connect:tcp://127.0.0.1:5555", False, "broadcast")

@@ -1,4 +1,4 @@
-"""What every channel to a broker promises: the same sentences for all of them, on real servers."""
+"""What every channel promises: the same sentences for all brokers, on real servers, and for peers without a broker."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from epypes.transport.address import open_channel, parse_address
 from epypes.transport.channel import ChannelOptions
 from tests.brokers import mosquitto as mosquitto_servers
 from tests.brokers import nats as nats_servers
-from tests.transport.channels import WAIT_S, Receiver, Sender, body
+from tests.transport.channels import PEERS, WAIT_S, OfPeers, Receiver, Sender, body, join
 from tests.transport.peers import line_of, process, wait_until
 
 
@@ -90,9 +90,20 @@ def queue(peer, name):
     return peer.address(name, create=True)
 
 
+@pytest.fixture(params=[*at("within", "rabbitmq", "nats", "mosquitto"), *PEERS])
+def carrier(request):
+    """Each of the brokers in turn, and each middleware without one."""
+    return OfPeers(request.param) if request.param in PEERS else request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def place(carrier, name):
+    return carrier.address(name, create=True)
+
+
 def attempts(peer, count):
-    """Return what a delivery says of its attempt: MQTT does not count."""
-    return 0 if peer.name == "mosquitto" else count
+    """Return what a delivery says of its attempt: MQTT does not count, and without a broker there is none."""
+    return 0 if peer.name == "mosquitto" or isinstance(peer, OfPeers) else count
 
 
 FRAMES = {
@@ -105,8 +116,9 @@ FRAMES = {
 }
 
 
-def test_frames_arrive_as_they_were_sent_and_can_not_be_changed(queue, opened):
-    receiver, sender = opened(Receiver, queue), opened(Sender, queue)
+def test_frames_arrive_as_they_were_sent_and_can_not_be_changed(place, opened):
+    receiver, sender = opened(Receiver, place), opened(Sender, place)
+    join(sender, receiver)
     for kind, frames in FRAMES.items():
         sender.send(*frames)
         delivery = receiver.next()
@@ -115,11 +127,12 @@ def test_frames_arrive_as_they_were_sent_and_can_not_be_changed(queue, opened):
         delivery.ack()
 
 
-def test_id_and_headers_come_along_if_there_are_any(peer, queue, opened):
-    sender, receiver = opened(Sender, queue), opened(Receiver, queue, prefetch=2)
+def test_id_and_headers_come_along_if_there_are_any(carrier, place, opened):
+    sender, receiver = opened(Sender, place), opened(Receiver, place, prefetch=2)
+    join(sender, receiver)
     sender.send(b"a", b"b", id="event 1: grün", headers={"epypes-x": "grün, 1"})
     delivery = receiver.next()
-    assert (delivery.id, delivery.attempt) == ("event 1: grün", attempts(peer, 1))
+    assert (delivery.id, delivery.attempt) == ("event 1: grün", attempts(carrier, 1))
     assert delivery.headers == {"epypes-x": "grün, 1"}
     sender.send(b"a")
     delivery = receiver.next()
@@ -129,8 +142,9 @@ def test_id_and_headers_come_along_if_there_are_any(peer, queue, opened):
 ODD = ["\r\nMore: 1", "a\nb", " a", "a ", "\x1b[31m", "\ud800", "\uffff", "a\0"]
 
 
-def test_what_would_not_arrive_as_it_is_is_refused_and_the_next_goes_out(queue, opened):
-    sender, receiver = opened(Sender, queue), opened(Receiver, queue, prefetch=100)
+def test_what_would_not_arrive_as_it_is_is_refused_and_the_next_goes_out(place, opened):
+    sender, receiver = opened(Sender, place), opened(Receiver, place, prefetch=100)
+    join(sender, receiver)
     for text in ODD:
         with pytest.raises(MessageError, match="can't be sent"):
             sender.send(b"a", id=text)
@@ -147,8 +161,8 @@ def test_what_would_not_arrive_as_it_is_is_refused_and_the_next_goes_out(queue, 
     assert len(receiver.next().frames) == 1_026
 
 
-def test_a_message_over_the_limit_of_the_channel_is_refused(queue, opened):
-    sender = opened(Sender, queue, max_message_bytes=1_000)
+def test_a_message_over_the_limit_of_the_channel_is_refused(place, opened):
+    sender = opened(Sender, place, max_message_bytes=1_000)
     with pytest.raises(MessageError) as refused:
         sender.send(bytes(1_001))
     assert refused.value.reason == "too large"
@@ -169,12 +183,14 @@ def test_what_is_sent_before_or_after_the_consumer_came_arrives_in_order(queue, 
         delivery.ack()
 
 
-def test_close_sends_what_was_accepted(queue, opened):
-    sender, outcomes = opened(Sender, queue), []
+def test_close_sends_what_was_accepted(place, opened):
+    sender, receiver, outcomes = opened(Sender, place), opened(Receiver, place, prefetch=100), []
+    join(sender, receiver)
     for number in range(100):
         sender.channel.send([b"%d" % number], confirmed=outcomes.append)
     sender.channel.close(WAIT_S)
     assert outcomes == [None] * 100
+    assert {body(delivery) for delivery in receiver.take(100)} == {b"%d" % number for number in range(100)}
     with pytest.raises(BrokerError, match="closed"):
         sender.channel.send([b"late"])
 
@@ -355,11 +371,12 @@ def test_a_message_is_settled_from_any_thread(queue, opened):
     assert body(opened(Receiver, queue).next()) == b"last"
 
 
-def test_a_broadcast_reaches_all_that_are_connected_and_is_not_kept(peer, name, opened):
-    address = peer.address(name, kind="broadcast", create=True)
+def test_a_broadcast_reaches_all_that_are_connected_and_is_not_kept(carrier, name, opened):
+    address = carrier.address(name, kind="broadcast", create=True)
     sender = opened(Sender, address)
     sender.send(b"too early")
     receivers = [opened(Receiver, address) for _ in range(3)]
+    join(sender, *receivers)
     for number in range(100):
         sender.channel.send([b"%d" % number, b""], id=f"{number}")
     for receiver in receivers:
@@ -448,9 +465,10 @@ def test_a_broker_that_goes_away_and_comes_back_gets_and_keeps_every_message_but
     assert (receiver.channel.trouble, sender.channel.waiting) == ("", 0)
 
 
-def test_closed_channels_leave_no_thread_behind(queue):
+def test_closed_channels_leave_no_thread_behind(place):
     def use():
-        sender, receiver = Sender(queue), Receiver(queue)
+        sender, receiver = Sender(place), Receiver(place)
+        join(sender, receiver)
         sender.send(b"a")
         receiver.next().ack()
         sender.channel.close()

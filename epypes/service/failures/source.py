@@ -255,7 +255,7 @@ def _check_shared(path: Path, address: str) -> None:
     from epypes.transport.address import parse_address
 
     place = parse_address(address)
-    if place.is_broker or place.binds is False:
+    if not place.is_zeromq or place.binds is False:
         text = f"The service of {path} sends its failures to {place}; listen there, or ask its http URL."
         raise ServiceError(path, text)
 

@@ -88,16 +88,21 @@ def pack(frames: Frames, id: str, headers: Mapping[str, str]) -> tuple[bytes, di
     Raises
     ------
     MessageError
-        There are too few or too many frames, or the id or a header would not arrive as it is at every broker.
+        As from `check_message`.
     """
+    check_message(frames, id, headers)
+    if len(frames) == 1:
+        return bytes(frames[0]), dict(headers)
+    return b"".join(frames), {**headers, SIZES: ",".join(str(len(frame)) for frame in frames)}
+
+
+def check_message(frames: Frames, id: str, headers: Mapping[str, str]) -> None:  # noqa: A002
+    """Raise MessageError if there are too few or too many frames, or the id or a header would not arrive as it is."""
     if not 0 < len(frames) <= _MOST_FRAMES:
         raise MessageError(_BAD, f"A message has 1 to {_MOST_FRAMES:,} frames, not {len(frames):,}.")
     _check_text("bad id", "The id", id)
     for name, text in headers.items():
         _check_text("bad header", f"The header {name[:40]!r}", text)
-    if len(frames) == 1:
-        return bytes(frames[0]), dict(headers)
-    return b"".join(frames), {**headers, SIZES: ",".join(str(len(frame)) for frame in frames)}
 
 
 def _check_text(reason: str, what: str, text: str) -> None:
