@@ -27,7 +27,7 @@ _KINDS: Final = {
     genicam.intfIEnumeration: "choice",
     genicam.intfIString: "text",
 }
-# pylon closes a camera of GigE Vision that has not answered for this long; of USB it is told at once.
+# pylon closes a camera of GigE Vision that has not answered for this long; USB reports a removal at once.
 _HEARTBEAT_MS: Final = 1_000
 _LAST_GIGE_ID: Final = 65_535
 # pylon keeps 38 kB of each device that it has made, but none of one that is opened again. By pylon's full name.

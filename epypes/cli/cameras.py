@@ -1,4 +1,4 @@
-"""The command cameras: what cameras there are, and how ep.camera is told which one."""
+"""The command cameras: the cameras that there are, with the addresses that ep.camera takes."""
 
 from __future__ import annotations
 

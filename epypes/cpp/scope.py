@@ -246,7 +246,7 @@ class Scope:
         return written(value, name, node)
 
     def is_simple(self, name: str) -> bool:
-        """Whether one block assigns a variable, and only what comes after it in that block reads it."""
+        """Whether one block assigns a variable, and all statements that read it come later in that block."""
         stores: list[tuple[Any, ...]] = []
         loads: list[tuple[Any, ...]] = []
         for path, each in _places(self.node.body, ()):

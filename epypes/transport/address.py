@@ -397,9 +397,14 @@ def _read_password(bare: Address, path: Path) -> str:
         raise AddressError(str(bare), text) from error
 
 
+def scheme_of(address: str) -> Scheme | None:
+    """Return the scheme of an address as it is written; None for any other, as ``bind:tcp`` and ``http``."""
+    return SCHEMES.get(address.partition("://")[0])
+
+
 def is_broker(address: str) -> bool:
     """Return whether an address is one of a broker, which keeps messages until they are acknowledged."""
-    known = SCHEMES.get(address.partition("://")[0])
+    known = scheme_of(address)
     return known is not None and known.is_broker
 
 

@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("epypes.transport")
 
+# Messages that nothing keeps are dropped when those that wait for the handler take more than this.
+MOST_BACKLOG_BYTES: Final = 256 * 1024**2
+MESSAGE_OVERHEAD_BYTES: Final = 1_024
+# A caller of `close` waits so much longer than its time-out for the end of a connection.
+CLOSING_GRACE_S: Final = 0.5
+
 Frames = Sequence[bytes | memoryview]
 NO_HEADERS: Final[Mapping[str, str]] = MappingProxyType({})
 

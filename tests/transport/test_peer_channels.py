@@ -116,7 +116,7 @@ def test_what_a_full_queue_and_a_paused_subscriber_do_not_take_is_counted(place)
 
 
 def test_a_handler_that_fails_or_is_far_behind_loses_messages_which_are_counted(place, opened, monkeypatch, caplog):
-    monkeypatch.setattr("epypes.transport.peers.channel._MOST_BACKLOG_BYTES", 1_000_000)
+    monkeypatch.setattr("epypes.transport.peers.channel.MOST_BACKLOG_BYTES", 1_000_000)
     room, taken = threading.Semaphore(0), []
 
     def take(delivery):

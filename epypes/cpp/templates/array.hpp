@@ -794,6 +794,21 @@ R sum(const Array<T, N>& array) {
     return row_sums<R>(row)[{0}];
 }
 
+/// The part at one place of an axis: a view without that axis.
+template <class T, int N>
+Array<T, N - 1> part_at(const Array<T, N>& array, int axis, Size index) {
+    Array<T, N - 1> part;
+    part.data = array.data + index * array.strides[axis];
+    part.owner = array.owner;
+    for (int each = 0, target = 0; each < N; ++each) {
+        if (each != axis) {
+            part.shape[target] = array.shape[each];
+            part.strides[target++] = array.strides[each];
+        }
+    }
+    return part;
+}
+
 /// The sum along one axis.
 template <class R, class T, int N>
 Array<R, N - 1> sum(const Array<T, N>& array, int along) {
@@ -804,24 +819,9 @@ Array<R, N - 1> sum(const Array<T, N>& array, int along) {
         std::rotate(rows.begin() + axis, rows.begin() + axis + 1, rows.end());
         return row_sums<R>(reshape<N>(astype<R>(array), rows));
     }
-    Shape<N - 1> shape;
-    for (int each = 0, target = 0; each < N; ++each) {
-        if (each != axis) {
-            shape[target++] = array.shape[each];
-        }
-    }
-    Array<R, N - 1> total = full<R, N - 1>(shape, R{0});
+    Array<R, N - 1> total = full<R, N - 1>(part_at(array, axis, 0).shape, R{0});
     for (Size index = 0; index < array.shape[axis]; ++index) {
-        Array<T, N - 1> part;
-        part.data = array.data + index * array.strides[axis];
-        part.owner = array.owner;
-        for (int each = 0, target = 0; each < N; ++each) {
-            if (each != axis) {
-                part.shape[target] = array.shape[each];
-                part.strides[target++] = array.strides[each];
-            }
-        }
-        total = add<R>(total, part);
+        total = add<R>(total, part_at(array, axis, index));
     }
     return total;
 }
@@ -903,15 +903,7 @@ Array<T, N - 1> along_axis(const Array<T, N>& array, int along, Choose choose) {
     }
     Array<T, N - 1> found;
     for (Size index = 0; index < array.shape[axis]; ++index) {
-        Array<T, N - 1> part;
-        part.data = array.data + index * array.strides[axis];
-        part.owner = array.owner;
-        for (int each = 0, target = 0; each < N; ++each) {
-            if (each != axis) {
-                part.shape[target] = array.shape[each];
-                part.strides[target++] = array.strides[each];
-            }
-        }
+        const Array<T, N - 1> part = part_at(array, axis, index);
         found = index == 0 ? copy(part) : choose(found, part);
     }
     return found;

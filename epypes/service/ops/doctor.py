@@ -198,9 +198,9 @@ def _address(address: str) -> Check:
     """Check that an address can be bound now, that a broker has it, or that it can be opened."""
     from urllib.parse import urlsplit
 
-    from epypes.transport.address import SCHEMES
+    from epypes.transport.address import scheme_of
 
-    scheme = SCHEMES.get(address.partition("://")[0])
+    scheme = scheme_of(address)
     if scheme is not None and not scheme.is_zeromq:
         return _open_address(address)
     name = f"address {address}"

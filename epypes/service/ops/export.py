@@ -21,7 +21,7 @@ from epypes.bundle.manifest import SETTINGS, check_manifest
 from epypes.bundle.requirements import epypes_source, pins
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
-from epypes.transport.address import SCHEMES, is_broker
+from epypes.transport.address import is_broker, scheme_of
 
 # Python 3.11 is the oldest that EPypes runs on; the container takes the one that the bundle was proved with.
 _PYTHON: Final = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -243,7 +243,7 @@ def _extras(options: Sequence[str]) -> set[str]:
         if name == "--store":
             found.add("postgres" if value.startswith("postgres") else "store")
         else:
-            scheme = SCHEMES.get(value.partition("://")[0])
+            scheme = scheme_of(value)
             found.add("serve" if scheme is None else scheme.extra)
     return found - {""}
 

@@ -37,7 +37,17 @@ from epypes.transport.brokers.message import (
     pack,
     unpack,
 )
-from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames, confirm
+from epypes.transport.channel import (
+    CLOSING_GRACE_S,
+    MESSAGE_OVERHEAD_BYTES,
+    MOST_BACKLOG_BYTES,
+    NO_HEADERS,
+    ChannelOptions,
+    Confirmed,
+    Delivery,
+    Frames,
+    confirm,
+)
 
 log = logging.getLogger("epypes.transport")
 
@@ -49,17 +59,12 @@ _MOST_IN_FLIGHT: Final = 64
 _MOST_IN_FLIGHT_BYTES: Final = 32 * 1024**2
 # So many are delivered ahead of what is acknowledged as soon as the handler has it.
 _AHEAD: Final = 100
-# Messages that the broker doesn't keep are dropped when those that wait for the handler take more than this.
-_MOST_BACKLOG_BYTES: Final = 256 * 1024**2
-_MESSAGE_OVERHEAD_BYTES: Final = 1_024
 # A message that could not be put into the dead-letter queue is delivered again after this time.
 REDELIVERY_S: Final = 5.0
 # After this time without an acknowledgement a full prefetch window is worth a warning.
 STALLED_S: Final = 10.0
 # What the end of a connection takes at most.
 CLOSING_S: Final = 2.0
-# A caller of `close` waits for that so much longer than its time-out: a broker that answers needs less.
-_CLOSING_GRACE_S: Final = 0.5
 
 
 class BrokerSession(abc.ABC):
@@ -302,7 +307,7 @@ class BrokerChannel:
         self._call(self._start_closing, timeout_s)
         if not _thread.is_current():
             # If the broker does not answer, the rest happens in the background.
-            self._finished.wait(timeout_s + _CLOSING_GRACE_S)
+            self._finished.wait(timeout_s + CLOSING_GRACE_S)
 
     def abandon(self) -> None:
         """Close without waiting and without taking a lock: the garbage collector calls it."""
@@ -477,7 +482,7 @@ class BrokerChannel:
         if message.receipt is not None:
             self._unsettled.add(message)
             self._changed_s = monotonic()
-        elif self._backlog_bytes > _MOST_BACKLOG_BYTES:
+        elif self._backlog_bytes > MOST_BACKLOG_BYTES:
             if not self._is_dropping:
                 self._is_dropping = True
                 log.warning(
@@ -489,7 +494,7 @@ class BrokerChannel:
 
     def _shrink_backlog(self, size: int) -> None:
         self._backlog_bytes -= size
-        self._is_dropping = self._is_dropping and self._backlog_bytes > _MOST_BACKLOG_BYTES // 2
+        self._is_dropping = self._is_dropping and self._backlog_bytes > MOST_BACKLOG_BYTES // 2
 
     def _settle(self, message: IncomingMessage, verdict: str, reason: str) -> None:
         if message not in self._unsettled:
@@ -571,7 +576,7 @@ class BrokerChannel:
 
 
 def _size(message: IncomingMessage) -> int:
-    return len(message.body) + _MESSAGE_OVERHEAD_BYTES
+    return len(message.body) + MESSAGE_OVERHEAD_BYTES
 
 
 # The brokers that were warned of.

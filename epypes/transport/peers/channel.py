@@ -23,8 +23,11 @@ from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import Address
 from epypes.transport.brokers.message import check_message
 from epypes.transport.channel import (
+    CLOSING_GRACE_S,
     ERROR,
     ERROR_REASON,
+    MESSAGE_OVERHEAD_BYTES,
+    MOST_BACKLOG_BYTES,
     NO_HEADERS,
     ChannelOptions,
     Confirmed,
@@ -35,13 +38,8 @@ from epypes.transport.channel import (
 
 log = logging.getLogger("epypes.transport")
 
-# What may wait for the handler; a single message may always wait.
-_MOST_BACKLOG_BYTES: Final = 256 * 1024**2
-_MESSAGE_OVERHEAD_BYTES: Final = 1_024
 # How long the end of the interpreter waits for all sessions that were left open.
 _EXIT_S: Final = 2.0
-# A caller of `close` waits for the end of a session so much longer than its time-out.
-_CLOSING_GRACE_S: Final = 0.5
 
 
 class PeerSession(abc.ABC):
@@ -243,7 +241,7 @@ class PeerChannel:
             self._until_s = monotonic() + timeout_s
             self.abandon()
         # If the middleware does not end, or the handler does not return, the rest happens in the background.
-        self.join(timeout_s + _CLOSING_GRACE_S)
+        self.join(timeout_s + CLOSING_GRACE_S)
 
     def join(self, timeout_s: float) -> None:
         """Wait for the end of the channel's thread, unless this is it."""
@@ -269,10 +267,11 @@ class PeerChannel:
             self.reject("too large", f"A message of {size:,} bytes; the limit is {limit:,}.")
             return
         with self._lock:
-            if self._backlog_bytes and self._backlog_bytes + size > _MOST_BACKLOG_BYTES:
+            # A single message may always wait.
+            if self._backlog_bytes and self._backlog_bytes + size > MOST_BACKLOG_BYTES:
                 self.dropped += 1
                 return
-            self._backlog_bytes += size + _MESSAGE_OVERHEAD_BYTES
+            self._backlog_bytes += size + MESSAGE_OVERHEAD_BYTES
         self._events.put(Delivery(frames, id, headers=headers))
 
     def reject(self, reason: str, text: str) -> None:
@@ -317,7 +316,7 @@ class PeerChannel:
 
     def _hand_over(self, delivery: Delivery) -> None:
         with self._lock:
-            self._backlog_bytes -= sum(map(len, delivery.frames)) + _MESSAGE_OVERHEAD_BYTES
+            self._backlog_bytes -= sum(map(len, delivery.frames)) + MESSAGE_OVERHEAD_BYTES
             dropped, self._reported = self.dropped - self._reported, self.dropped
         text = "Messages come faster than they are handled."
         late = [Delivery((), headers={ERROR: text, ERROR_REASON: "too many at once"})] * dropped
