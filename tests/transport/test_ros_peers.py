@@ -47,6 +47,7 @@ ENVIRONMENT = {
     "ROS_DOMAIN_ID": str(DOMAIN),
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
 }
+_ENDING_S = 10.0
 ROS2 = Path(__file__).parents[2] / ".venv" / "ros2" / "bin" / "python"
 
 
@@ -99,6 +100,9 @@ class Peer:
 
     def end(self):
         self.process.terminate()
+        self.thread.join(_ENDING_S)
+        # A node of ROS 2 may miss the signal, and would run for ever.
+        self.process.kill()
         self.thread.join()
         self.process.wait()
         self.process.stdout.close()
