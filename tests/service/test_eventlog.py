@@ -37,6 +37,7 @@ def test_each_event_has_a_row(acting, tmp_path):
         peer.ask(number=8)
         peer.ask("kill")
         digest, sent = service.service_state.digest, list(peer.sent)
+        assert service.failure_store.flush()
         known = {record.event_id: record.id for record in service.failure_records()}
     rows = rows_of(path)
     assert [row["event_id"] for row in rows] == sent

@@ -98,7 +98,9 @@ def test_a_message_of_ros_2_gets_the_name_of_the_input_and_an_answer_that_is_non
         until(lambda: service.counts()["failed"])
         counts = service.counts()
         assert (counts["received"], counts["answered"], counts["failed"]) == (2, 1, 1)
-        assert "mask.astype('uint8')" in service.failure_records()[0].message
+        assert service.failure_store.flush()
+        (record,) = service.failure_records()
+        assert "mask.astype('uint8')" in record.message
 
 
 @pytest.mark.parametrize(
