@@ -30,6 +30,7 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "httpx": ("httpx", "serve"),
     "httpx_sse": ("httpx-sse", "serve"),
     "ipywidgets": ("ipywidgets", "widgets"),
+    "jinja2": ("jinja2", "cpp"),
     "jupyter_client": ("jupyter-client", "service"),
     "jupyter_server": ("jupyter-server", "notebook"),
     "jupyterlab": ("jupyterlab", "notebook"),

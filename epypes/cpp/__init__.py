@@ -1,7 +1,7 @@
 """The graph of a bundle as a C++ project that replays the bundle's samples.
 
 `export_cpp` writes it: ``record`` runs the samples once (``recorded``), ``Project`` translates the functions
-(``project``, ``statements``, ``expressions``, ``arrays``, ``opencv``), `write_project` fills the templates
+(``project``, ``statements``, ``expressions``, ``arrays``, ``opencv``), `write_project` renders the templates of Jinja2
 (``writer``). The interface of a written project, all in the namespace that is named after the bundle:
 
 - ``struct Hyperparameters``, ``Inputs``, ``Outputs``: one member per token, in the order of pipeline.toml. Each has
@@ -15,8 +15,8 @@
 
 ``Recording.tokens`` has a `TokenType` by token: its name in C++, its C++ type (``cpp``) and its type (``type``, see
 ``types``). An image of a dtype that OpenCV has, with two dimensions or a third one of channels, is a cv::Mat; any other
-array is a ``numpy::Array<T, N>`` of array.hpp; None or an array is a cv::Mat that may be empty. Templates are in
-``templates/``: ``@NAME@`` stands for what ``writer._Values.all`` returns.
+array is a ``numpy::Array<T, N>`` of array.hpp; None or an array is a cv::Mat that may be empty. A template
+in ``templates/`` has the name of the file that it becomes, and speaks of what ``writer._values`` returns.
 """
 
 from __future__ import annotations

@@ -5,15 +5,9 @@ Its C++ is in ``templates/service``; what depends on the graph is how events and
 
 from __future__ import annotations
 
-import json
 import math
-import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from epypes import __version__
 from epypes.cpp.types import (
     BOOL,
     DEPTHS,
@@ -39,120 +33,13 @@ if TYPE_CHECKING:
     from epypes.bundle.settings import Settings
     from epypes.cpp.recorded import Recording
 
-FOLDER: Final = "service"
-# For arrays that are no cv::Mat.
-_ARRAYS: Final = "arrays.hpp"
-_TEMPLATES: Final = Path(__file__).parent / "templates" / FOLDER
 # The methods of Reader and Writer for the records of OpenCV, in a list or a tuple.
 _RECORDS: Final = {"KeyPoint": "keypoints", "DMatch": "matches"}
 _READERS: Final = {FLOAT: "number", BOOL: "boolean", TEXT: "text", NONE: "none"}
 _SETTERS: Final = {FLOAT: "number", BOOL: "boolean", TEXT: "text"}
-_INDENT: Final = "    "
 
 
-def write_service(recording: Recording, namespace: str, folder: Path) -> None:
-    """Write the sources of the service into a project.
-
-    Parameters
-    ----------
-    recording
-        Of the bundle.
-    namespace
-        Of the graph in C++.
-    folder
-        Of the project.
-
-    Raises
-    ------
-    BundleError
-        An event can't bring a value of such a type, or no answer can carry it; the token is named.
-    """
-    bundle, cg, settings = recording.bundle, recording.bundle.cg, recording.bundle.settings
-    inputs, outputs = ([recording.tokens[token] for token in tokens] for tokens in (settings.inputs, settings.outputs))
-    own = {
-        "MARK": f"Written by EPypes from the bundle {settings.name}: the next export replaces it.",
-        "NS": namespace,
-        "BUNDLE": quoted(settings.name),
-        "DIGEST": quoted(bundle.digest),
-        "VERSION": quoted(__version__),
-        "INPUTS": "".join(f"{_INDENT}{quoted(token)},\n" for token in settings.inputs),
-        "OUTPUTS": "".join(f"{_INDENT}{quoted(token)},\n" for token in settings.outputs),
-        "INPUTS_OF_FUNCTIONS": "".join(f"{_INDENT}{{{_names(cg.func_inputs(name))}}},\n" for name in cg.functions),
-        "HYPERPARAMETERS": _json_literal(_entries(recording)),
-        "FUNC_IO": _json_literal({name: cg.func_io[name] for name in cg.functions}),
-        "READ": "".join(
-            f"{_INDENT}found.{token.name} = {_reading(token, settings, f'*values[{place}]')};\n"
-            for place, token in enumerate(inputs)
-        ),
-        "WRITE": "".join(f"{_INDENT}{_writing(token, settings)}\n" for token in outputs),
-    }
-    has_arrays = "_array" in own["READ"] + own["WRITE"]
-    own["INCLUDES"] = f'#include "{_ARRAYS}"\n' if has_arrays else ""
-    remove_service(folder)
-    (folder / FOLDER).mkdir(exist_ok=True)
-    for path in _sources():
-        if path.name == _ARRAYS and not has_arrays:
-            continue
-        text = re.sub(r"@([A-Z_]+)@", lambda found: own[found[1]], path.read_text(encoding="utf-8"))
-        (folder / FOLDER / path.name).write_text(text, encoding="utf-8")
-
-
-def remove_service(folder: Path) -> None:
-    """Remove what an earlier export has written of a service."""
-    for path in _sources():
-        (folder / FOLDER / path.name).unlink(missing_ok=True)
-    with suppress(OSError):
-        (folder / FOLDER).rmdir()
-
-
-def cmake_lines(name: str) -> str:
-    """Return what CMakeLists.txt of a project has for its service."""
-    sources = " ".join(f"{FOLDER}/{path.name}" for path in _sources() if path.suffix == ".cpp")
-    return f"""
-# The service: {name}_service --help
-find_package(Protobuf REQUIRED)
-find_package(nlohmann_json REQUIRED)
-find_package(PkgConfig REQUIRED)
-pkg_check_modules(MESSAGES REQUIRED IMPORTED_TARGET libzmq protobuf)
-# In Debian a library; elsewhere a header alone.
-find_library(HTTPLIB_LIBRARY cpp-httplib)
-if(NOT HTTPLIB_LIBRARY)
-  set(HTTPLIB_LIBRARY "")
-endif()
-protobuf_generate_cpp(PROTOBUF_SOURCES PROTOBUF_HEADERS {FOLDER}/envelope.proto)
-add_executable({name}_service {sources} ${{PROTOBUF_SOURCES}})
-target_include_directories({name}_service PRIVATE ${{CMAKE_CURRENT_BINARY_DIR}})
-target_link_libraries({name}_service PRIVATE
-  {name}_graph PkgConfig::MESSAGES nlohmann_json::nlohmann_json ${{HTTPLIB_LIBRARY}})
-"""
-
-
-def readme_lines(name: str) -> str:
-    """Return what README.md of a project says of its service."""
-    return f"""
-## Serve
-
-`{name}_service` takes events and publishes answers over ZeroMQ, as `epypes serve` does: `build/{name}_service --help`.
-It needs ZeroMQ, protobuf, nlohmann-json and cpp-httplib (Debian: `libzmq3-dev cppzmq-dev libprotobuf-dev
-protobuf-compiler nlohmann-json3-dev libcpp-httplib-dev pkg-config`). The messages are in `{FOLDER}/envelope.proto`.
-"""
-
-
-def _sources() -> list[Path]:
-    return sorted(path for path in _TEMPLATES.iterdir() if path.suffix in (".cpp", ".hpp", ".proto"))
-
-
-def _names(tokens: Sequence[str]) -> str:
-    return ", ".join(map(quoted, tokens))
-
-
-def _json_literal(value: Mapping[str, object]) -> str:
-    """Return JSON as a raw literal of C++, with a line for each item."""
-    lines = ",\n".join(f" {json.dumps(key)}: {json.dumps(part)}" for key, part in value.items())
-    return f'R"json({{\n{lines}\n}})json"'
-
-
-def _entries(recording: Recording) -> dict[str, dict[str, object]]:
+def entries(recording: Recording) -> dict[str, dict[str, object]]:
     """Return by name in C++ the hyperparameters as pipeline.toml has them, without numbers that JSON lacks."""
 
     def is_json(part: object) -> bool:
@@ -172,7 +59,7 @@ def _order(token: TokenType, settings: Settings) -> str:
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def _reading(token: TokenType, settings: Settings, value: str) -> str:
+def reading(settings: Settings, token: TokenType, value: str) -> str:
     """Return the expression that reads an input."""
     name, order, where = settings.name, _order(token, settings), quoted(token.token)
 
@@ -207,7 +94,7 @@ def _reading(token: TokenType, settings: Settings, value: str) -> str:
 # -- writing ----------------------------------------------------------------------------------------------------------
 
 
-def _writing(token: TokenType, settings: Settings) -> str:
+def writing(settings: Settings, token: TokenType) -> str:
     """Return the statement that writes an output."""
     name, order = settings.name, _order(token, settings)
 

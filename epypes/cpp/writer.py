@@ -1,35 +1,31 @@
-"""The folder of a C++ project: the text of its files, from templates."""
+"""The folder of a C++ project: its files, from the templates of Jinja2 in ``templates/``."""
 
 from __future__ import annotations
 
 import functools
+import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from epypes import __version__
 from epypes.cpp import types as t
 from epypes.cpp.project import CppFunction, Project
 from epypes.cpp.samples import write_sample
-from epypes.cpp.service import cmake_lines, readme_lines, remove_service, write_service
+from epypes.cpp.service import entries, reading, writing
 from epypes.errors import BundleError
+from epypes.optional import optional_import
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 MARK: Final = "Written by EPypes from the bundle"
 BY_HAND: Final = "by_hand.cpp"
-_ALWAYS: Final = ("graph.hpp", "graph.cpp", "main.cpp", "test.cpp", "values.hpp", "CMakeLists.txt", "README.md")
+_SERVICE: Final = "service/"
 _WIDTH: Final = 110
-_NAME: Final = r"@([A-Z_]+)@"
-# Parts that stand inside of a class or a function.
-_INSIDE: Final = ("STATE_MEMBER", "STATE_TEST", "IMAGE_IN", "RGB_IN")
-_ON_TOP: Final = """\
-// The functions that are written by hand. EPypes changes nothing here: it adds what is missing at the end.
-#include <stdexcept>
-
-#include <opencv2/opencv.hpp>
-
-#include "graph.hpp"
-"""
 # A function as it is added to the file: nothing in it is by hand yet.
 _STUB: Final = re.compile(
     r"\nnamespace \w+ \{\n\n// By hand: [^\n]*\n(?://[^\n]*\n)*[^\n]*\{\n"
@@ -43,31 +39,28 @@ def write_project(project: Project, folder: Path, *, is_served: bool = False) ->
     Raises
     ------
     BundleError
-        The folder is there and is no such project, or it can't be written.
+        The folder is there and is no such project, or it can't be written; or there is to be a service, and an event
+        can't bring a value of such a type, or no answer can carry it.
     """
+    templates = _templates(project)
     try:
         if folder.exists() and not _is_own(folder):
             raise BundleError(folder, f"{folder} is there and was not written by this command. Name another folder.")
         (folder / "samples").mkdir(parents=True, exist_ok=True)
-        _write_by_hand(project, folder / BY_HAND)
-        values = _Values(project, (folder / BY_HAND).exists()).all()
-        if is_served:
-            values |= {
-                "EXTRA": cmake_lines(namespace_of(project)),
-                "SERVICE_TEXT": readme_lines(namespace_of(project)),
-            }
-            write_service(project.recording, namespace_of(project), folder)
-        else:
-            remove_service(folder)
-        headers = [
-            name for name in ("array.hpp", "python.hpp") if f'"{name}"' in values["GRAPH_INCLUDES"] + values["INCLUDES"]
-        ]
-        if "array.hpp" in headers and "python.hpp" not in headers:
-            headers.append("python.hpp")
-        for name in (*_ALWAYS, *headers):
-            (folder / name).write_text(_filled(name, values), encoding="utf-8")
-        for name in {"array.hpp", "python.hpp"} - {*headers}:
-            (folder / name).unlink(missing_ok=True)
+        _write_by_hand(project, folder / BY_HAND, templates)
+        values = _values(project, is_served) | {"has_by_hand": (folder / BY_HAND).exists()}
+        names = [name for name in templates.list_templates() if name != BY_HAND]
+        values["service_sources"] = [name for name in names if name.startswith(_SERVICE) and name.endswith(".cpp")]
+        texts = {name: templates.get_template(name).render(values) for name in names if _is_needed(name, values)}
+        for name in names:
+            if name in texts:
+                (folder / name).parent.mkdir(exist_ok=True)
+                (folder / name).write_text(texts[name], encoding="utf-8")
+            else:
+                (folder / name).unlink(missing_ok=True)
+        if not is_served:
+            with suppress(OSError):
+                (folder / _SERVICE).rmdir()
         _write_samples(project, folder / "samples")
     except OSError as error:
         raise BundleError(folder, f"{folder} can't be written: {error}. Name another folder.") from error
@@ -80,21 +73,134 @@ def _is_own(folder: Path) -> bool:
     )
 
 
-def _filled(name: str, values: Mapping[str, str]) -> str:
-    text = (files("epypes.cpp") / "templates" / name).read_text("utf-8")
-    for _ in range(3):  # a part has names of its own
-        text = re.sub(_NAME, lambda found: values.get(found[1], found[0]), text)
-    if not name.endswith(("cpp", "hpp")):
-        return text
-    return "\n".join(short for line in text.split("\n") for short in wrapped(line))
+def _is_needed(name: str, values: Mapping[str, Any]) -> bool:
+    """Whether a project has a file."""
+    if name in ("array.hpp", "python.hpp"):
+        needed = {"array", name.removesuffix(".hpp")}
+        return bool(values["has_arrays"] or needed & values["helpers"])
+    is_array = name == f"{_SERVICE}arrays.hpp"
+    return not name.startswith(_SERVICE) or bool(values["is_served"] and (values["has_served_arrays"] or not is_array))
 
 
-def _parts(name: str, is_used: bool) -> dict[str, str]:
-    """Return the parts of a template that stands in others only where it is used."""
-    text = (files("epypes.cpp") / "templates" / f"{name}_parts.hpp").read_text("utf-8")
-    found = re.findall(r"// @(\w+)\n(.*?)(?=// @)", text, flags=re.S)
+def _templates(project: Project) -> Environment:
+    """Return the templates, in which an expression is @{...}, since C++ has {{ }} of its own."""
+    with optional_import():
+        import jinja2
+    settings = project.recording.bundle.settings
+    templates = jinja2.Environment(
+        loader=jinja2.PackageLoader("epypes.cpp"), undefined=jinja2.StrictUndefined, autoescape=False,  # noqa: S701
+        keep_trailing_newline=True, trim_blocks=True, lstrip_blocks=True,
+        variable_start_string="@{", variable_end_string="}"
+    )  # fmt: skip
+    templates.filters |= {
+        "quoted": t.quoted, "json": json.dumps, "one_line": _one_line, "wrapped": _wrapped, "initial": _initial,
+        "head_without_names": _head_without_names, "reading": functools.partial(reading, settings),
+        "writing": functools.partial(writing, settings), "source": functools.partial(_source, project),
+    }  # fmt: skip
+    return templates
+
+
+def _values(project: Project, is_served: bool) -> dict[str, Any]:
+    """Return what the templates speak of."""
+    recording, settings = project.recording, project.recording.bundle.settings
+    cg, tokens = recording.bundle.cg, recording.tokens
+    inputs, outputs = ([tokens[token] for token in names] for names in (settings.inputs, settings.outputs))
+    called = [each for each, _ in project.called.values()]
+    begins = {**settings.hyperparameters, **{token: delay.initial for token, delay in cg.delays.items()}}
+    members = [
+        *(each.cpp for each in tokens.values()),
+        *(each.signature for each in (*called, *project.functions)),
+        *(_initial(value, tokens[token]) for token, value in begins.items()),
+    ]
     return {
-        part: f"{lines.rstrip()}\n" + "\n" * (part not in _INSIDE) if is_used and lines else "" for part, lines in found
+        "mark": f"{MARK} {settings.name}: the next export replaces it.",
+        "title": f"The graph {settings.name}: {', '.join(settings.inputs)} -> {', '.join(settings.outputs)}",
+        "ns": namespace_of(project),
+        "by_hand": BY_HAND,
+        "epypes_version": __version__,
+        "is_served": is_served,
+        "recording": recording,
+        "settings": settings,
+        "cg": cg,
+        "functions": project.functions,
+        "called": called,
+        "helpers": project.helpers,
+        "hyperparameters": recording.hyperparameters,
+        "inputs": inputs,
+        "outputs": outputs,
+        "states": [tokens[token] for token in cg.delays],
+        "has_arrays": "numpy::" in "".join(members),
+        "has_served_arrays": "numpy::" in "".join(each.cpp for each in (*inputs, *outputs)),
+        "image": _image(project, inputs[0]) if len(inputs) == 1 else None,
+        "entries": entries(recording),
+        "about": functools.partial(_about, project),
+        "bounds_of": functools.partial(_bounds, project),
+    }
+
+
+def _source(project: Project, token: t.TokenType, *, is_recorded: bool = False) -> str:
+    """Return where a function finds a token: in a run, or in the replay of a sample."""
+    settings = project.recording.bundle.settings
+    if token.token in settings.hyperparameters:
+        return f"h.{token.name}"
+    if token.token in project.recording.bundle.cg.delays and not is_recorded:
+        return f"state_.{token.name}"
+    return f"inputs.{token.name}" if token.token in settings.inputs and not is_recorded else token.name
+
+
+def _about(project: Project, token: t.TokenType) -> str:
+    """Return what the comment beside a member says."""
+    settings = project.recording.bundle.settings
+    kind: Any = token.type
+    if token.token in settings.hyperparameters:
+        entry = settings.entries.get(token.token, {})
+        unit = f"in {entry['unit']}" if "unit" in entry else ""
+        words = [entry.get("about", "").rstrip("."), *_bounds(project, token), unit]
+        return _one_line("; ".join(filter(None, words)))
+    order = settings.order(token.token) if token.token in settings.colours else ""
+    is_image = isinstance(kind, t.ArrayType) and kind.is_mat and kind.ndim > 1
+    shape = ("(height, width)", f"(height, width, {kind.channels})")[kind.ndim - 2] if is_image else ""
+    return ", ".join(filter(None, (kind.dtype, shape, order)))
+
+
+def _bounds(project: Project, token: t.TokenType) -> dict[str, str]:
+    """Return the limits of a hyperparameter in words, each with its test in C++."""
+    entry = project.recording.bundle.settings.entries.get(token.token, {})
+    signs = (("low", "at least", ">="), ("high", "at most", "<="))
+    found = {f"{word} {entry[key]}": f"{token.name} {sign} {entry[key]!r}" for key, word, sign in signs if key in entry}
+    return found | ({"odd": f"{token.name} % 2 != 0"} if entry.get("odd") else {})
+
+
+def _initial(value: Any, token: t.TokenType) -> str:
+    """Return what follows the name of a member that begins with a value."""
+    kind = token.type
+    if not isinstance(kind, t.ArrayType):
+        return f" = {t.literal(value, kind)}"
+    if value is None:
+        return ""
+    numbers = ", ".join(t.literal(item, t.number(kind.dtype)) for item in value.reshape(-1))
+    shape = ", ".join(map(str, value.shape))
+    array = f"numpy::array<{t.ELEMENTS[kind.dtype]}, {value.ndim}>({{{shape}}}, {{{numbers}}})"
+    return f" = numpy::mat({array})" if kind.is_mat else f" = {array}"
+
+
+def _image(project: Project, token: t.TokenType) -> dict[str, Any] | None:
+    """Return how the program reads its only input from an image file: as cv2.imread reads what was recorded."""
+    kind, settings = token.type, project.recording.bundle.settings
+    if not isinstance(kind, t.ArrayType) or not kind.is_mat:
+        return None
+    depth = "" if kind.dtype == "uint8" else "cv::IMREAD_ANYDEPTH"
+    colour = {2: "cv::IMREAD_GRAYSCALE", 3: "cv::IMREAD_COLOR"}.get(kind.ndim, "cv::IMREAD_ANYCOLOR")
+    is_whole = kind.channels not in (0, 1, 3)
+    tests = [f"image.depth() != {t.DEPTHS[kind.dtype]}"] * bool(kind.dtype)
+    tests += [f"image.channels() != {kind.channels or 1}"] * (kind.ndim == 2 or kind.channels > 0)
+    is_rgb = token.token in settings.rgb and kind.ndim != 2
+    code = "RGBA" if kind.channels == 4 else "RGB"
+    return {
+        "token": token,
+        "flags": "cv::IMREAD_UNCHANGED" if is_whole else " | ".join(filter(None, (colour, depth))),
+        "is_other": " || ".join(tests) or "false",
+        "to_rgb": f"cv::COLOR_{code.replace('RGB', 'BGR')}2{code}" if is_rgb else "",
     }
 
 
@@ -109,14 +215,14 @@ def _write_samples(project: Project, folder: Path) -> None:
         write_sample(folder / f"{name}.yml.gz", recording.tokens, tokens)
 
 
-def _write_by_hand(project: Project, path: Path) -> None:
+def _write_by_hand(project: Project, path: Path, templates: Environment) -> None:
     """Write what is by hand: the functions that stand there remain, also in place of a translation; others are added.
 
     A function that is still as it was added is no one's work: it goes, or is added anew.
     """
     text = _STUB.sub("", path.read_text("utf-8")) if path.exists() else ""
     code = re.sub(r"//[^\n]*|^#[^\n]*|/\*.*?\*/", "", text, flags=re.S | re.M)
-    namespace, stubs = namespace_of(project), ""
+    added = []
     for each in project.functions:
         definitions = re.findall(rf"[^;{{}}]*\b{each.name}\s*\([^;{{}}]*\)(?=\s*\{{)", code)
         if definitions:
@@ -127,18 +233,13 @@ def _write_by_hand(project: Project, path: Path) -> None:
                 each.reason = f"signature of {each.name} has changed: was {was}, is {each.signature}"
                 each.line = ""
         elif each.is_by_hand:
-            message = t.quoted(f"{each.name} is still to be written by hand: see {BY_HAND}")
-            lines = [
-                f"// By hand: {each.reason_with_line}",
-                "//",
-                *(f"//     {line}".rstrip() for line in each.source.splitlines()),
-            ]
-            lines += [f"{_unnamed(each)} {{", f"    throw std::logic_error({message});", "}"]
-            stubs += f"\nnamespace {namespace} {{\n\n" + "\n".join(lines) + f"\n\n}}  // namespace {namespace}\n"
-    if not stubs and text in ("", _ON_TOP):
+            added.append(each)
+    template = templates.get_template(BY_HAND)
+    values = {"ns": namespace_of(project), "by_hand": BY_HAND}
+    if not added and text in ("", template.render(values, text="", added=[])):
         path.unlink(missing_ok=True)
     else:
-        path.write_text((text or _ON_TOP) + stubs, encoding="utf-8")
+        path.write_text(template.render(values, text=text.removesuffix("\n"), added=added), encoding="utf-8")
 
 
 def _types_of(signature: str) -> tuple[str, ...]:
@@ -152,7 +253,7 @@ def _types_of(signature: str) -> tuple[str, ...]:
     return tuple(re.sub(r"\s*(\W)\s*", r"\1", each.strip()) for each in parts)
 
 
-def _unnamed(function: CppFunction) -> str:
+def _head_without_names(function: CppFunction) -> str:
     """Return the head of a function whose parameters are not used yet."""
     return re.sub(r" (\w+)(?=[,)])(?=(?:[^<>]|<[^<>]*>)*$)", r" /*\1*/", function.signature)
 
@@ -168,262 +269,16 @@ def _taken() -> tuple[str, ...]:
     return tuple((files("epypes.cpp") / "data" / "global_names.txt").read_text("utf-8").split())
 
 
-class _Values:
-    """What stands in the templates in the place of names."""
-
-    def __init__(self, project: Project, has_by_hand: bool) -> None:
-        self.project, self.recording, self.has_by_hand = project, project.recording, has_by_hand
-        self.settings = self.recording.bundle.settings
-        self.namespace = namespace_of(project)
-        self.hyperparameters = self.recording.hyperparameters
-        self.inputs = [self.recording.tokens[token] for token in self.settings.inputs]
-        self.outputs = [self.recording.tokens[token] for token in self.settings.outputs]
-
-    def all(self) -> dict[str, str]:
-        """Return them all."""
-        names = [each.name for each in self.project.functions]
-        declared = [*self.project.called.values()]
-        signatures = [*(each.signature for each, _ in declared), *(each.signature for each in self.project.functions)]
-        members = self._members(self.hyperparameters, self._hyperparameter)
-        has_array = "numpy::" in "".join([members, *signatures, *(each.cpp for each in self.recording.tokens.values())])
-        helpers = self.project.helpers
-        delays = self.recording.bundle.cg.delays
-        states = [(self.recording.tokens[token], delay.initial) for token, delay in delays.items()]
-        ends = f"{', '.join(self.settings.inputs)} -> {', '.join(self.settings.outputs)}"
-        array = '#include "array.hpp"\n'
-        includes = [array * ("array" in helpers), '#include "python.hpp"\n' * ("python" in helpers)]
-        return {
-            "MARK": f"{MARK} {self.settings.name}: the next export replaces it.",
-            "TITLE": f"The graph {self.settings.name}: {ends}",
-            "NAME": self.namespace,
-            "NS": self.namespace,
-            "SOURCES": " ".join(["graph.cpp", *([BY_HAND] if self.has_by_hand else [])]),
-            "TESTS": " ".join([*names, "whole_graph"]),
-            "EXTRA": "",
-            "SERVICE_TEXT": "",
-            "GRAPH_INCLUDES": f"\n{array}" if has_array else "",
-            "INCLUDES": "\n" + "".join(includes),
-            "HYPERPARAMETERS": members,
-            "INPUTS": self._members(self.inputs, self._member),
-            "OUTPUTS": self._members(self.outputs, self._member),
-            "EACH_HYPERPARAMETER": self._each(self.hyperparameters),
-            "EACH_INPUT": self._each(self.inputs),
-            "EACH_OUTPUT": self._each(self.outputs),
-            "DECLARATIONS": "\n".join(f"{each.signature};" for each in self.project.functions),
-            "COUNT": str(len(names)),
-            "FUNCTION_NAMES": ", ".join(map(t.quoted, names)),
-            "HELPERS": "".join(f"{each.signature};\n" for each, _ in declared) + ("\n" if declared else ""),
-            "FUNCTIONS": self._functions(),
-            "CHECKS": "".join(self._checks()),
-            "RUN": self._run(),
-            "STATE_MEMBERS": "".join(f"    {self._initial(*each)}\n" for each in states),
-            "EACH_STATE": self._each(token for token, _ in states),
-            **_parts("array", has_array),
-            **_parts("state", bool(states)),
-            **self._image(),
-            "TOKENS": ", ".join(t.quoted(token.name) for token in self._compared()),
-            "TOLERANCES": ", ".join(
-                f"{{{t.quoted(self.recording.tokens[token].name)}, {{{bound.absolute!r}, {bound.relative!r}}}}}"
-                for token, bound in self.settings.tolerances.items()
-            ),
-            "CASES": self._cases(),
-            "CASE_LIST": ", ".join(f"{{{t.quoted(name)}, test_{name}}}" for name in [*names, "whole_graph"]),
-            "SAMPLES": ", ".join(map(t.quoted, self.recording.runs)),
-            "TABLE": self._table(),
-            "BY_HAND_TEXT": self._by_hand_text()
-        }  # fmt: skip
-
-    # -- members ------------------------------------------------------------------------------------------------------
-
-    @staticmethod
-    def _members(tokens: Iterable[t.TokenType], text: Any) -> str:
-        lines = "".join(f"    {text(each)}\n" for each in tokens)
-        return f"{lines}" if lines else ""
-
-    @staticmethod
-    def _each(tokens: Iterable[t.TokenType]) -> str:
-        return "\n".join(f"        visit({t.quoted(each.name)}, self.{each.name});" for each in tokens)
-
-    def _member(self, token: t.TokenType) -> str:
-        about = self._about(token)
-        return f"{token.cpp} {token.name}{{}};{about and f'  // {about}'}"
-
-    def _about(self, token: t.TokenType) -> str:
-        kind: Any = token.type
-        order = self.settings.order(token.token) if token.token in self.settings.colours else ""
-        is_image = isinstance(kind, t.ArrayType) and kind.is_mat and kind.ndim > 1
-        shape = ("(height, width)", f"(height, width, {kind.channels})")[kind.ndim - 2] if is_image else ""
-        return ", ".join(part for part in (kind.dtype, shape, order) if part)
-
-    def _entry(self, token: t.TokenType) -> Mapping[str, Any]:
-        return self.settings.entries.get(token.token, {})
-
-    def _hyperparameter(self, token: t.TokenType) -> str:
-        entry = self._entry(token)
-        text = self._initial(token, self.settings.hyperparameters[token.token])
-        words = [
-            entry.get("about", "").rstrip("."),
-            *self._limits(entry),
-            f"in {entry['unit']}" if "unit" in entry else "",
-        ]
-        about = _one_line("; ".join(filter(None, words)))
-        return f"{text}{about and f'  // {about}'}"
-
-    @staticmethod
-    def _limits(entry: Mapping[str, Any]) -> list[str]:
-        limits = [f"at {word} {entry[key]}" for key, word in (("low", "least"), ("high", "most")) if key in entry]
-        return limits + ["odd"] * bool(entry.get("odd"))
-
-    def _checks(self) -> Iterable[str]:
-        for token in self.hyperparameters:
-            entry, name = self._entry(token), token.name
-            is_number = isinstance(token.type, t.Int) or token.cpp == "double"
-            signs = (("low", ">="), ("high", "<="))
-            tests = [f"{name} {sign} {entry[key]!r}" for key, sign in signs if key in entry]
-            tests += [f"{name} % 2 != 0"] * bool(entry.get("odd"))
-            if tests and is_number:
-                message = t.quoted(f"{token.token} has to be {' and '.join(self._limits(entry))}")
-                yield f"    if (!({' && '.join(tests)})) {{\n        throw std::invalid_argument({message});\n    }}\n"
-
-    @staticmethod
-    def _initial(token: t.TokenType, value: Any) -> str:
-        """Return a member that begins with a value."""
-        text = (
-            _array_literal(value, token.type)
-            if isinstance(token.type, t.ArrayType)
-            else f" = {t.literal(value, token.type)}"
-        )
-        return f"{token.cpp} {token.name}{text};"
-
-    # -- functions ----------------------------------------------------------------------------------------------------
-
-    def _functions(self) -> str:
-        local = [each for each, _ in self.project.called.values()]
-        texts = ["\n".join(each.lines or ()) for each in local]
-        inner = "namespace {\n\n" + "\n\n".join(texts) + "\n\n}  // namespace\n\n" if local else ""
-        own = ["\n".join(each.lines) for each in self.project.functions if each.lines is not None]
-        return inner + "".join(f"{text}\n\n" for text in own)
-
-    def _argument(self, token: t.TokenType) -> str:
-        if token.token in self.settings.hyperparameters:
-            return f"h.{token.name}"
-        if token.token in self.recording.bundle.cg.delays:
-            return f"state_.{token.name}"
-        return f"inputs.{token.name}" if token.token in self.settings.inputs else token.name
-
-    def _run(self) -> str:
-        lines = []
-        for index, each in enumerate(self.project.functions):
-            arguments = ", ".join(map(self._argument, self.recording.inputs_of(each.function)))
-            made = self.recording.outputs_of(each.function)
-            single = self.recording.bundle.cg.has_single_output(each.function)
-            target = made[0].name if single else f"[{', '.join(token.name for token in made)}]"
-            kind = made[0].cpp if single else "auto"
-            lines += [
-                f"running_ = {index};",
-                "begin = Clock::now();",
-                f"const {kind} {target} = {self.namespace}::{each.name}({arguments});",
-                f"seconds_[{index}] = seconds_since(begin);",
-                "",
-            ]
-        delays = self.recording.bundle.cg.delays
-        if delays:
-            lines.append("State state;")
-            pairs = [
-                (self.recording.tokens[token], self.recording.tokens[each.token]) for token, each in delays.items()
-            ]
-            lines += [f"state.{state.name} = owned({self._argument(token)});" for state, token in pairs]
-            lines.append("state_ = state;")
-        lines += ["total_seconds_ = seconds_since(first);", "Outputs outputs;"]
-        lines += [f"outputs.{each.name} = {self._argument(each)};" for each in self.outputs]
-        return "".join(f"    {line}\n" if line else "\n" for line in lines)
-
-    def _cases(self) -> str:
-        texts = []
-        for each in self.project.functions:
-            given, made = self.recording.inputs_of(each.function), self.recording.outputs_of(each.function)
-            inputs = [token for token in given if token.token not in self.settings.hyperparameters]
-            lines = [
-                f"const auto {token.name} = read<{token.cpp}>(sample[{t.quoted(token.name)}]);" for token in {*inputs}
-            ]
-            arguments = [token.name if token in inputs else f"h.{token.name}" for token in given]
-            lines = [*sorted(lines), *[f"const {self.namespace}::Hyperparameters h;"] * (len(inputs) < len(given))]
-            call = f"{self.namespace}::{each.name}({', '.join(arguments)})"
-            is_single = self.recording.bundle.cg.has_single_output(each.function)
-            lines += [] if is_single else [f"const auto results = {call};"]
-            for index, token in enumerate(made):
-                got = call if is_single else f"std::get<{index}>(results)"
-                lines.append(f"report.compare({t.quoted(token.name)}, sample[{t.quoted(token.name)}], {got});")
-            texts.append(_function(f"void test_{each.name}(const cv::FileNode& sample, Report& report)", lines))
-        return "\n".join(texts)
-
-    def _compared(self) -> list[t.TokenType]:
-        """Return the tokens that the replay compares."""
-        return [token for each in self.project.functions for token in self.recording.outputs_of(each.function)]
-
-    # -- the program --------------------------------------------------------------------------------------------------
-
-    def _image(self) -> dict[str, str]:
-        """Return how the program reads its only input from an image file: as cv2.imread reads what was recorded."""
-        token = self.inputs[0] if len(self.inputs) == 1 else None
-        kind: Any = token.type if token is not None else None
-        parts = _parts("image", isinstance(kind, t.ArrayType) and kind.is_mat)
-        if token is None or not parts["IMAGE_IN"]:
-            return parts
-        depth = "" if kind.dtype == "uint8" else "cv::IMREAD_ANYDEPTH"
-        colour = {2: "cv::IMREAD_GRAYSCALE", 3: "cv::IMREAD_COLOR"}.get(kind.ndim, "cv::IMREAD_ANYCOLOR")
-        is_whole = kind.channels not in (0, 1, 3)
-        flags = "cv::IMREAD_UNCHANGED" if is_whole else " | ".join(filter(None, (colour, depth)))
-        tests = [f"image.depth() != {t.DEPTHS[kind.dtype]}"] * bool(kind.dtype)
-        tests += [f"image.channels() != {kind.channels or 1}"] * (kind.ndim == 2 or kind.channels > 0)
-        is_rgb = token.token in self.settings.rgb and kind.ndim != 2
-        code = "RGBA" if kind.channels == 4 else "RGB"
-        return {
-            "IMAGE_IN": parts["IMAGE_IN"],
-            "RGB_IN": parts["RGB_IN"] if is_rgb else "",
-            "RGB_CODE": f"cv::COLOR_{code.replace('RGB', 'BGR')}2{code}",
-            "IMREAD_FLAGS": flags,
-            "IS_OTHER_IMAGE": " || ".join(tests) or "false",
-            "IMAGE": token.name,
-            "IMAGE_TEXT": f"an array of {self._about(token)}",
-        }
-
-    # -- README -------------------------------------------------------------------------------------------------------
-
-    def _table(self) -> str:
-        rows = ["| function | translated | by hand, why |", "|--|--|--|"]
-        for each in self.project.functions:
-            translated = "" if each.is_by_hand else "yes"
-            rows.append(f"| `{each.function}` | {translated} | {_one_line(each.reason_with_line)} |")
-        return "\n".join(rows)
-
-    def _by_hand_text(self) -> str:
-        if not any(each.is_by_hand for each in self.project.functions):
-            return "All functions are translated."
-        return f"What is by hand stands in `{BY_HAND}`, with its Python source; its test fails until it is written."
-
-
-def _function(head: str, lines: Sequence[str]) -> str:
-    return "".join([f"{head} {{\n", *(f"    {line}\n" for line in lines), "}\n"])
-
-
 def _one_line(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|").rstrip("\\")
 
 
-def _array_literal(value: Any, kind: t.ArrayType) -> str:
-    """Return what follows the name of a member that begins with an array."""
-    if value is None:
-        return ""
-    numbers = ", ".join(t.literal(item, t.number(kind.dtype)) for item in value.reshape(-1))
-    array = (
-        f"numpy::array<{t.ELEMENTS[kind.dtype]}, {value.ndim}>({{{', '.join(map(str, value.shape))}}}, {{{numbers}}})"
-    )
-    return f" = numpy::mat({array})" if kind.is_mat else f" = {array}"
+def _wrapped(text: str) -> str:
+    """Return C++ in lines that are no longer than a reader likes where they have a comma to break at."""
+    return "\n".join(short for line in text.split("\n") for short in _lines(line))
 
 
-def wrapped(line: str, *, is_continued: bool = False) -> list[str]:
-    """Return the lines of a statement, none longer than a reader likes where it has a comma to break at."""
+def _lines(line: str, *, is_continued: bool = False) -> list[str]:
     if len(line) <= _WIDTH or line.lstrip().startswith("//"):
         return [line]
     depth, is_text = 0, False
@@ -441,4 +296,4 @@ def wrapped(line: str, *, is_continued: bool = False) -> list[str]:
     # The outermost place keeps together what belongs together.
     end, indent = breaks[min(breaks)], line[: len(line) - len(line.lstrip())]
     more = indent if is_continued else f"{indent}        "
-    return [line[:end].rstrip(), *wrapped(f"{more}{line[end:].strip()}", is_continued=True)]
+    return [line[:end].rstrip(), *_lines(f"{more}{line[end:].strip()}", is_continued=True)]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
+
+from tests.cpp.building import bundle_of
 
 pytestmark = pytest.mark.packaging
 
@@ -335,6 +338,17 @@ def test_tables_travel(environment):
 
 def test_cluster_maps_on_dask(environment):
     environment("cluster").python(GRAPH + CLUSTER)
+
+
+def test_cpp_exports_a_bundle(environment, tmp_path):
+    source = "def half(image):\n    return image[::2, ::2]"
+    image = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    bundle_of(tmp_path / "halves", source, {"half": [(image,)]}, lambda half, inputs: half(**inputs))
+    alone = environment("cpp")
+    done = alone.epypes("export", "cpp", str(tmp_path / "halves"), "--to", "halves_cpp", "--service")
+    assert done.stdout.splitlines()[1].split() == ["half", "yes"], done.stderr
+    assert (alone.folder / "halves_cpp" / "service" / "tokens.cpp").is_file()
+    assert alone.has(*JUPYTER, "cv2") == []
 
 
 def test_store_keeps_rows(environment):

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 import traceback
 
 import cv2
@@ -15,7 +16,7 @@ from PIL import Image
 
 import epypes as ep
 from epypes.cli import app
-from epypes.errors import BundleError
+from epypes.errors import BundleError, MissingPackage
 
 LEVEL = 20
 
@@ -133,6 +134,13 @@ def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
     assert "Leave it out of the outputs, or have 'sizes' return a tuple" in str(refused.value)
     # The frames are those of the caller and of the exporting module, none below.
     assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
+
+
+def test_without_jinja_the_extra_that_brings_it_is_named(bundle, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(MissingPackage, match=r"Package 'jinja2' is missing. Run: pip install '.*\[cpp\]'"):
+        ep.export_cpp(bundle, tmp_path / "cpp")
+    assert not (tmp_path / "cpp").exists()
 
 
 def test_numpy_1_is_refused(bundle, tmp_path, monkeypatch):

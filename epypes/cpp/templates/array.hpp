@@ -1,4 +1,4 @@
-// @MARK@
+// @{mark}
 // Arrays as NumPy has them: elements of any type, any number of dimensions, views, and arithmetic that wraps.
 #pragma once
 
@@ -108,10 +108,12 @@ R cast(T value) {
     if constexpr (std::is_same_v<R, bool>) {
         return value != 0;
     } else if constexpr (std::is_floating_point_v<T> && std::is_integral_v<R>) {
-        using Whole = std::conditional_t<(sizeof(R) < 4 || std::is_same_v<R, std::int32_t>), std::int32_t, std::int64_t>;
+        using Whole = std::conditional_t<(sizeof(R) < 4 ||
+                std::is_same_v<R, std::int32_t>), std::int32_t, std::int64_t>;
         constexpr double limit = sizeof(Whole) == 4 ? 2147483648.0 : 9223372036854775808.0;
         const double whole = std::trunc(static_cast<double>(value));
-        return static_cast<R>(whole >= -limit && whole < limit ? static_cast<Whole>(whole) : std::numeric_limits<Whole>::min());
+        return static_cast<R>(whole >= -limit &&
+                whole < limit ? static_cast<Whole>(whole) : std::numeric_limits<Whole>::min());
     } else {
         return static_cast<R>(value);
     }
@@ -209,7 +211,8 @@ auto apply(F function, const A&... operands) {
         (widen<rank>(shape, operands), ...);
         const Array<R, rank> made = empty<R, rank>(shape);
         auto* next = reinterpret_cast<R*>(made.data);
-        for_each<rank>(shape, [&](const auto&... values) { *next++ = function(values...); }, stretched<rank>(operands, shape)...);
+        for_each<rank>(shape, [&](const auto&... values) { *next++ = function(values...); },
+                stretched<rank>(operands, shape)...);
         return made;
     }
 }
@@ -294,7 +297,8 @@ cv::Mat mat(const Array<T, N>& given) {
         return cv::Mat(rows, columns, type);
     }
     const Size row = columns * channels * static_cast<Size>(sizeof(T));
-    cv::Mat image(rows, columns, type, array.data, static_cast<std::size_t>(rows == 1 ? row : array.strides[0]));
+    cv::Mat image(rows, columns, type, array.data,
+            static_cast<std::size_t>(rows == 1 ? row : array.strides[0]));
     image.u = array.owner.u;  // the image keeps the memory
     image.addref();
     return image;
@@ -499,7 +503,8 @@ auto isfinite(const A& one) {
 
 template <class R, class C, class A, class B>
 auto where(const C& condition, const A& one, const B& other) {
-    return apply([](auto c, auto a, auto b) -> R { return c != 0 ? cast<R>(a) : cast<R>(b); }, condition, one, other);
+    return apply([](auto c, auto a, auto b) -> R { return c != 0 ? cast<R>(a) : cast<R>(b); }, condition, one,
+            other);
 }
 
 /// The numbers within two bounds; NaN stays, and a bound that is NaN gives it.
@@ -532,7 +537,8 @@ inline Step from(Size low, Size step = 1) { return {Step::Kind::slice, low, 0, s
 
 inline Step to(Size high, Size step = 1) { return {Step::Kind::slice, 0, high, step, false, true}; }
 
-inline Step between(Size low, Size high, Size step = 1) { return {Step::Kind::slice, low, high, step, true, true}; }
+inline Step between(Size low, Size high,
+        Size step = 1) { return {Step::Kind::slice, low, high, step, true, true}; }
 
 inline Step every(Size step) { return {Step::Kind::slice, 0, 0, step, false, false}; }
 
@@ -563,7 +569,8 @@ Array<T, M> view(const Array<T, N>& array, std::initializer_list<Step> steps) {
         }
         const Size least = step.step < 0 ? -1 : 0;
         const Size most = step.step < 0 ? size - 1 : size;
-        const auto bound = [&](Size index) { return std::clamp(index < 0 ? index + size : index, least, most); };
+        const auto bound = [&](Size index) { return std::clamp(index < 0 ? index + size : index, least,
+                most); };
         const Size low = step.has_low ? bound(step.low) : step.step < 0 ? most : least;
         const Size high = step.has_high ? bound(step.high) : step.step < 0 ? least : most;
         const Size away = step.step < 0 ? low - high : high - low;
@@ -629,7 +636,8 @@ void assign(const Array<T, N>& target, const V& values) {
     if constexpr (Traits<V>::rank > 0) {
         // What is written may overlap with what is read.
         const auto source = copy(values);
-        for_each<N>(target.shape, [](const T& place, const auto& value) { const_cast<T&>(place) = cast<T>(value); },
+        for_each<N>(target.shape,
+                [](const T& place, const auto& value) { const_cast<T&>(place) = cast<T>(value); },
                     Operand<T, N>{target.data, target.strides}, stretched<N>(source, target.shape));
     } else {
         for_each<N>(target.shape, [&](const T& place) { const_cast<T&>(place) = cast<T>(values); },
@@ -642,7 +650,8 @@ template <int M>
 std::vector<Size> places(const Array<bool, M>& mask) {
     std::vector<Size> found;
     Size place = 0;
-    for_each<M>(mask.shape, [&](bool is_set) { is_set ? found.push_back(place++) : void(++place); }, Operand<bool, M>{mask.data, mask.strides});
+    for_each<M>(mask.shape, [&](bool is_set) { is_set ? found.push_back(place++) : void(++place); },
+            Operand<bool, M>{mask.data, mask.strides});
     return found;
 }
 
@@ -691,7 +700,9 @@ Array<T, N - M + 1> take(const Array<T, N>& array, const Array<bool, M>& mask) {
 template <class I, class T, int N, class = std::enable_if_t<!std::is_same_v<I, bool>>>
 Array<T, N> take(const Array<T, N>& array, const Array<I, 1>& indices) {
     std::vector<Size> found;
-    for_each<1>(indices.shape, [&](I index) { found.push_back(static_cast<Size>(python::place(static_cast<Size>(index), array.shape[0]))); },
+    for_each<1>(indices.shape,
+            [&](I index) { found.push_back(static_cast<Size>(python::place(static_cast<Size>(index),
+            array.shape[0]))); },
                 Operand<I, 1>{indices.data, indices.strides});
     return taken(array, found);
 }
@@ -705,7 +716,9 @@ void put(const Array<T, N>& array, const Array<bool, M>& mask, const V& values) 
         wide.data = mask.data;
         wide.shape = array.shape;
         std::copy(mask.strides.begin(), mask.strides.end(), wide.strides.begin());
-        for_each<N>(array.shape, [&](const T& place, bool is_set) { is_set ? void(const_cast<T&>(place) = cast<T>(values)) : void(); },
+        for_each<N>(array.shape,
+                [&](const T& place,
+                bool is_set) { is_set ? void(const_cast<T&>(place) = cast<T>(values)) : void(); },
                     Operand<T, N>{array.data, array.strides}, Operand<bool, N>{wide.data, wide.strides});
     } else {
         static_assert(M == N && Traits<V>::rank == 1);
@@ -911,12 +924,14 @@ Array<T, N - 1> along_axis(const Array<T, N>& array, int along, Choose choose) {
 
 template <class T, int N>
 Array<T, N - 1> max(const Array<T, N>& array, int along) {
-    return along_axis(array, along, [](const auto& one, const auto& other) { return maximum<T>(one, other); });
+    return along_axis(array, along,
+            [](const auto& one, const auto& other) { return maximum<T>(one, other); });
 }
 
 template <class T, int N>
 Array<T, N - 1> min(const Array<T, N>& array, int along) {
-    return along_axis(array, along, [](const auto& one, const auto& other) { return minimum<T>(one, other); });
+    return along_axis(array, along,
+            [](const auto& one, const auto& other) { return minimum<T>(one, other); });
 }
 
 template <class T, int N>
@@ -1006,7 +1021,8 @@ Array<T, N> sort(const Array<T, N>& array) {
     const Size length = array.shape[N - 1];
     auto* row = reinterpret_cast<T*>(made.data);
     for (Size index = 0; length > 0 && index < made.size() / length; ++index, row += length) {
-        std::sort(row, row + length, [](T left, T right) { return left < right || (right != right && left == left); });
+        std::sort(row, row + length,
+                [](T left, T right) { return left < right || (right != right && left == left); });
     }
     return made;
 }

@@ -1,4 +1,5 @@
-// @MARK@
+{% filter wrapped %}
+// @{mark}
 // Runs the graph on one image, or on values in a file of cv::FileStorage, and writes its outputs.
 #include <cstdlib>
 #include <exception>
@@ -15,7 +16,7 @@
 
 namespace {
 
-constexpr const char* usage = R"(Usage: @NAME@ INPUT [--out FOLDER] [--HYPERPARAMETER VALUE ...] [-h | --help]
+constexpr const char* usage = R"(Usage: @{ns} INPUT [--out FOLDER] [--HYPERPARAMETER VALUE ...] [-h | --help]
 
 INPUT is an image, or a file of cv::FileStorage with a value for each input, as those in samples/. Images are written to
 FOLDER as PNG, all other outputs to results.yml there. Hyperparameters:
@@ -32,8 +33,8 @@ constexpr bool is_plain = std::is_arithmetic_v<T> || std::is_same_v<T, std::stri
 
 void print_usage(std::ostream& stream) {
     stream << usage;
-    @NS@::Hyperparameters hyperparameters;
-    @NS@::Hyperparameters::each(hyperparameters, [&](const char* name, const auto& member) {
+    @{ns}::Hyperparameters hyperparameters;
+    @{ns}::Hyperparameters::each(hyperparameters, [&](const char* name, const auto& member) {
         if constexpr (is_plain<std::decay_t<decltype(member)>>) {
             stream << "  --" << name << " " << values::text(member) << "\n";
         }
@@ -41,9 +42,9 @@ void print_usage(std::ostream& stream) {
 }
 
 /// Changes a hyperparameter by its name; returns whether there is one.
-bool change(@NS@::Hyperparameters& hyperparameters, const std::string& name, const std::string& value) {
+bool change(@{ns}::Hyperparameters& hyperparameters, const std::string& name, const std::string& value) {
     bool found = false;
-    @NS@::Hyperparameters::each(hyperparameters, [&](const char* own, auto& member) {
+    @{ns}::Hyperparameters::each(hyperparameters, [&](const char* own, auto& member) {
         if (name == own) {
             using T = std::decay_t<decltype(member)>;
             if constexpr (is_plain<T>) {
@@ -57,12 +58,26 @@ bool change(@NS@::Hyperparameters& hyperparameters, const std::string& name, con
     return found;
 }
 
-void read_inputs(const std::string& path, @NS@::Inputs& inputs) {
-@IMAGE_IN@    const cv::FileStorage file(path, cv::FileStorage::READ);
+void read_inputs(const std::string& path, @{ns}::Inputs& inputs) {
+{% if image %}
+    cv::Mat image = cv::imread(path, @{image.flags});
+    if (!image.empty()) {
+        if (@{image.is_other}) {
+            throw std::invalid_argument("@{image.token.name} has to be an array of @{about(image.token)}; " + path + " is read as " +
+                                        cv::typeToString(image.type()));
+        }
+{% if image.to_rgb %}
+        cv::cvtColor(image, image, @{image.to_rgb});  // the graph takes RGB
+{% endif %}
+        inputs.@{image.token.name} = image;
+        return;
+    }
+{% endif %}
+    const cv::FileStorage file(path, cv::FileStorage::READ);
     if (!file.isOpened()) {
         throw std::invalid_argument(path + " can't be read");
     }
-    @NS@::Inputs::each(inputs, [&](const char* name, auto& member) {
+    @{ns}::Inputs::each(inputs, [&](const char* name, auto& member) {
         if (file[name].empty()) {
             throw std::invalid_argument(path + " has no value for " + name);
         }
@@ -70,12 +85,12 @@ void read_inputs(const std::string& path, @NS@::Inputs& inputs) {
     });
 }
 
-void write_outputs(const std::string& folder, const @NS@::Outputs& outputs) {
+void write_outputs(const std::string& folder, const @{ns}::Outputs& outputs) {
     cv::FileStorage file(folder + "/results.yml", cv::FileStorage::WRITE);
     if (!file.isOpened()) {
         throw std::invalid_argument(folder + " is no folder that can be written to");
     }
-    @NS@::Outputs::each(outputs, [&](const char* name, const auto& member) {
+    @{ns}::Outputs::each(outputs, [&](const char* name, const auto& member) {
         if constexpr (std::is_same_v<std::decay_t<decltype(member)>, cv::Mat>) {
             const bool is_image = (member.depth() == CV_8U || member.depth() == CV_16U) && member.channels() != 2;
             if (is_image && member.channels() <= 4 && !member.empty()) {
@@ -91,7 +106,7 @@ void write_outputs(const std::string& folder, const @NS@::Outputs& outputs) {
 }
 
 int run(int count, char** arguments) {
-    @NS@::Hyperparameters hyperparameters;
+    @{ns}::Hyperparameters hyperparameters;
     std::string input;
     std::string folder = ".";
     for (int index = 1; index < count; ++index) {
@@ -120,12 +135,12 @@ int run(int count, char** arguments) {
     if (input.empty()) {
         throw UsageError("there is no input");
     }
-    @NS@::Inputs inputs;
+    @{ns}::Inputs inputs;
     read_inputs(input, inputs);
-    @NS@::Graph graph(hyperparameters);
+    @{ns}::Graph graph(hyperparameters);
     write_outputs(folder, graph.run(inputs));
     for (std::size_t index = 0; index < graph.seconds().size(); ++index) {
-        std::cout << @NS@::Graph::functions[index] << ": " << 1e3 * graph.seconds()[index] << " ms\n";
+        std::cout << @{ns}::Graph::functions[index] << ": " << 1e3 * graph.seconds()[index] << " ms\n";
     }
     return 0;
 }
@@ -144,3 +159,4 @@ int main(int count, char** arguments) {
         return 1;
     }
 }
+{% endfilter %}

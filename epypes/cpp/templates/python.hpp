@@ -1,4 +1,4 @@
-// @MARK@
+// @{mark}
 // Numbers and lists as Python has them: what C++ does otherwise, or what it would not notice.
 #pragma once
 
@@ -100,7 +100,8 @@ T narrow(V value) {
             overflow();
         }
     } else {
-        if (value < 0 ? std::is_unsigned_v<T> || value < static_cast<std::int64_t>(std::numeric_limits<T>::min())
+        if (value < 0 ? std::is_unsigned_v<T> ||
+                value < static_cast<std::int64_t>(std::numeric_limits<T>::min())
                       : static_cast<std::uint64_t>(value) > static_cast<std::uint64_t>(std::numeric_limits<T>::max())) {
             overflow();
         }
@@ -235,7 +236,8 @@ T at(const std::vector<T>& items, std::int64_t index) {
 template <class T>
 std::vector<T> slice(const std::vector<T>& items, std::int64_t low, std::int64_t high) {
     const std::int64_t count = length(items);
-    const auto bound = [count](std::int64_t index) { return std::clamp<std::int64_t>(index < 0 ? index + count : index, 0, count); };
+    const auto bound = [count](std::int64_t index) { return std::clamp<std::int64_t>(index < 0 ? index + count : index,
+            0, count); };
     const std::int64_t first = bound(low);
     return {items.begin() + first, items.begin() + std::max(first, bound(high))};
 }
@@ -289,7 +291,8 @@ std::vector<T> sorted(std::vector<T> items, bool reverse) {
         }
     }
     if (reverse) {
-        std::stable_sort(items.begin(), items.end(), [](const T& left, const T& right) { return right < left; });
+        std::stable_sort(items.begin(), items.end(),
+                [](const T& left, const T& right) { return right < left; });
     } else {
         std::stable_sort(items.begin(), items.end());
     }

@@ -1,4 +1,5 @@
-// @MARK@
+{% filter wrapped %}
+// @{mark}
 // Replays the recorded samples: each function with its recorded inputs, and the graph as a whole.
 //
 //   replay [--only FUNCTION] [--tolerance TOKEN=ABSOLUTE[,RELATIVE]] [--samples FOLDER]
@@ -21,7 +22,11 @@ namespace {
 /// Compares tokens with what was recorded, and prints what it finds.
 class Report {
   public:
-    std::map<std::string, values::Tolerance> tolerances{@TOLERANCES@};
+    std::map<std::string, values::Tolerance> tolerances{
+{%- for token, bound in settings.tolerances.items() %}
+{@{recording.tokens[token].name | quoted}, {@{bound.absolute}, @{bound.relative}}}@{", " if not loop.last}
+{%- endfor %}
+};
 
     void begin(const std::string& name, const std::string& sample) { where_ = "sample " + sample + ", " + name + ", "; }
 
@@ -65,13 +70,38 @@ T read(const cv::FileNode& node) {
     return value;
 }
 
-@CASES@
+{% for function in functions %}
+{% set given, made = recording.inputs_of(function.function), recording.outputs_of(function.function) %}
+void test_@{function.name}(const cv::FileNode& sample, Report& report) {
+{% for token in given | reject("in", hyperparameters) | unique | sort(attribute="name", case_sensitive=true) %}
+    const auto @{token.name} = read<@{token.cpp}>(sample[@{token.name | quoted}]);
+{% endfor %}
+{% if given | select("in", hyperparameters) | list %}
+    const @{ns}::Hyperparameters h;
+{% endif %}
+{% set call = ns ~ "::" ~ function.name ~ "(" ~ given | map("source", is_recorded=true) | join(", ") ~ ")" %}
+{% if cg.has_single_output(function.function) %}
+    report.compare(@{made[0].name | quoted}, sample[@{made[0].name | quoted}], @{call});
+{% else %}
+    const auto results = @{call};
+{% for token in made %}
+    report.compare(@{token.name | quoted}, sample[@{token.name | quoted}], std::get<@{loop.index0}>(results));
+{% endfor %}
+{% endif %}
+}
+
+{% endfor %}
 void test_whole_graph(const cv::FileNode& sample, Report& report) {
-    @NS@::Inputs inputs;
-    @NS@::Inputs::each(inputs, [&](const char* name, auto& member) { values::read_value(sample[name], member); });
-    @NS@::Graph graph;
-@STATE_TEST@    const @NS@::Outputs outputs = graph.run(inputs);
-    @NS@::Outputs::each(outputs, [&](const char* name, const auto& got) { report.compare(name, sample[name], got); });
+    @{ns}::Inputs inputs;
+    @{ns}::Inputs::each(inputs, [&](const char* name, auto& member) { values::read_value(sample[name], member); });
+    @{ns}::Graph graph;
+{% if states %}
+    @{ns}::State state;
+    @{ns}::State::each(state, [&](const char* name, auto& member) { values::read_value(sample[name], member); });
+    graph.set_state(state);
+{% endif %}
+    const @{ns}::Outputs outputs = graph.run(inputs);
+    @{ns}::Outputs::each(outputs, [&](const char* name, const auto& got) { report.compare(name, sample[name], got); });
 }
 
 struct Case {
@@ -79,9 +109,17 @@ struct Case {
     void (*run)(const cv::FileNode& sample, Report& report);
 };
 
-const std::vector<Case> cases{@CASE_LIST@};
+const std::vector<Case> cases{
+{%- for function in functions %}
+{@{function.name | quoted}, test_@{function.name}}, @{""}
+{%- endfor %}
+{"whole_graph", test_whole_graph}};
 
-const std::vector<std::string> tokens{@TOKENS@};
+const std::vector<std::string> tokens{
+{%- for function in functions %}
+@{recording.outputs_of(function.function) | map(attribute="name") | map("quoted") | join(", ")}@{", " if not loop.last}
+{%- endfor %}
+};
 
 constexpr const char* usage = R"(Usage: replay [--only FUNCTION] [--tolerance TOKEN=ABSOLUTE[,RELATIVE] ...] [--samples FOLDER]
 )";
@@ -130,7 +168,7 @@ int run(int count, char** arguments) {
         }
     }
     int compared = 0;
-    for (const char* sample : {@SAMPLES@}) {
+    for (const char* sample : {@{recording.runs | map("quoted") | join(", ")}}) {
         const cv::FileStorage file(folder + "/" + sample + ".yml.gz", cv::FileStorage::READ);
         if (!file.isOpened()) {
             std::cerr << folder << "/" << sample << ".yml.gz can't be read\n";
@@ -170,3 +208,4 @@ int main(int count, char** arguments) {
         return 2;
     }
 }
+{% endfilter %}

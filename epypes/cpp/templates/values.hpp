@@ -19,7 +19,11 @@
 
 #include <opencv2/core.hpp>
 
-@ARRAY_INCLUDE@namespace values {
+{% if has_arrays %}
+#include "array.hpp"
+
+{% endif %}
+namespace values {
 
 /// How far numbers may be from what is expected; `relative` is a part of the expected one's magnitude.
 struct Tolerance {
@@ -46,7 +50,8 @@ struct Difference {
         }
     }
 
-    void add_number(const std::string& where, const std::string& left, const std::string& right, double distance) {
+    void add_number(const std::string& where, const std::string& left, const std::string& right,
+            double distance) {
         add(where, left, right);
         largest = std::max(largest.value_or(0.0), distance);
     }
@@ -133,7 +138,24 @@ inline void read_value(const cv::FileNode& node, cv::DMatch& match) {
     read_value(node[3], match.distance);
 }
 
-@ARRAY_READ@template <class T>
+{% if has_arrays %}
+template <class T, int N>
+void read_value(const cv::FileNode& node, numpy::Array<T, N>& array) {
+    numpy::Shape<N> shape{};
+    int axis = 0;
+    for (const cv::FileNode& size : node["shape"]) {
+        shape.at(axis++) = static_cast<int>(size);
+    }
+    array = numpy::empty<T, N>(shape);
+    cv::Mat bytes;
+    node["bytes"] >> bytes;
+    if (array.size() > 0) {
+        std::memcpy(array.data, bytes.data, static_cast<std::size_t>(array.size()) * sizeof(T));
+    }
+}
+
+{% endif %}
+template <class T>
 void read_value(const cv::FileNode& node, std::optional<T>& value);
 
 template <class... T>
@@ -181,7 +203,23 @@ inline void write_value(cv::FileStorage& file, const cv::DMatch& match) {
     file << "[" << text(match.queryIdx) << text(match.trainIdx) << text(match.imgIdx) << text(match.distance) << "]";
 }
 
-@ARRAY_WRITE@template <class T>
+{% if has_arrays %}
+template <class T, int N>
+void write_value(cv::FileStorage& file, const numpy::Array<T, N>& array) {
+    const numpy::Array<T, N> whole = numpy::contiguous(array);
+    const int size = static_cast<int>(whole.size() * static_cast<numpy::Size>(sizeof(T)));
+    file << "{"
+         << "shape"
+         << "[";
+    for (const numpy::Size each : whole.shape) {
+        file << static_cast<int>(each);
+    }
+    file << "]"
+         << "bytes" << cv::Mat(1, size, CV_8U, whole.data) << "}";
+}
+
+{% endif %}
+template <class T>
 void write_value(cv::FileStorage& file, const std::optional<T>& value);
 
 template <class... T>
@@ -236,11 +274,13 @@ void compare_numbers(const T& expected, const T& got, const Tolerance& tolerance
 }
 
 template <class T, class = std::enable_if_t<std::is_arithmetic_v<T>>>
-void compare(const T& expected, const T& got, const Tolerance& tolerance, const std::string& where, Difference& found) {
+void compare(const T& expected, const T& got, const Tolerance& tolerance, const std::string& where,
+        Difference& found) {
     compare_numbers(expected, got, tolerance, where, 0.0, found);
 }
 
-inline void compare(const std::string& expected, const std::string& got, const Tolerance&, const std::string& where,
+inline void compare(const std::string& expected, const std::string& got, const Tolerance&,
+        const std::string& where,
                     Difference& found) {
     if (expected != got) {
         found.add(where, expected, got);
@@ -253,7 +293,8 @@ double floor_of(const std::vector<T>& numbers) {
     if constexpr (std::is_floating_point_v<T>) {
         double largest = 0.0;
         for (const T number : numbers) {
-            largest = std::isfinite(number) ? std::max(largest, std::abs(static_cast<double>(number))) : largest;
+            largest = std::isfinite(number) ? std::max(largest,
+                    std::abs(static_cast<double>(number))) : largest;
         }
         return 16.0 * std::sqrt(static_cast<double>(std::numeric_limits<T>::epsilon())) * largest;
     } else {
@@ -265,12 +306,14 @@ template <class T>
 std::vector<T> elements(const cv::Mat& image) {
     const cv::Mat whole = image.isContinuous() ? image : image.clone();
     const auto* first = reinterpret_cast<const T*>(whole.data);
-    return first == nullptr ? std::vector<T>{} : std::vector<T>(first, first + whole.total() * whole.channels());
+    return first == nullptr ? std::vector<T>{} : std::vector<T>(first,
+            first + whole.total() * whole.channels());
 }
 
 /// Compares the numbers of two arrays of one shape.
 template <class T>
-void compare_elements(const std::vector<T>& expected, const std::vector<T>& got, const std::vector<std::int64_t>& shape,
+void compare_elements(const std::vector<T>& expected, const std::vector<T>& got,
+        const std::vector<std::int64_t>& shape,
                       const Tolerance& tolerance, const std::string& where, Difference& found) {
     const double magnitude = floor_of(expected);
     for (std::size_t index = 0; index < expected.size(); ++index) {
@@ -287,12 +330,14 @@ void compare_elements(const std::vector<T>& expected, const std::vector<T>& got,
     }
 }
 
-inline void compare(const cv::Mat& expected, const cv::Mat& got, const Tolerance& tolerance, const std::string& where,
+inline void compare(const cv::Mat& expected, const cv::Mat& got, const Tolerance& tolerance,
+        const std::string& where,
                     Difference& found) {
     const auto described = [](const cv::Mat& image) {
         return std::to_string(image.rows) + " x " + std::to_string(image.cols) + " of type " + cv::typeToString(image.type());
     };
-    if (expected.size() != got.size() || (expected.type() != got.type() && !(expected.empty() && got.empty()))) {
+    if (expected.size() != got.size() ||
+            (expected.type() != got.type() && !(expected.empty() && got.empty()))) {
         found.add_shape(where, described(expected), described(got));
         return;
     }
@@ -335,7 +380,35 @@ inline void compare(const cv::DMatch& expected, const cv::DMatch& got, const Tol
     compare(expected.distance, got.distance, tolerance, where + ".distance", found);
 }
 
-@ARRAY_COMPARE@template <class T>
+{% if has_arrays %}
+template <class T, int N>
+void compare(const numpy::Array<T, N>& expected, const numpy::Array<T, N>& got, const Tolerance& tolerance,
+             const std::string& where, Difference& found) {
+    const auto described = [](const numpy::Array<T, N>& array) {
+        std::string sizes;
+        for (const numpy::Size each : array.shape) {
+            sizes += (sizes.empty() ? "" : ", ") + std::to_string(each);
+        }
+        return "an array of (" + sizes + ")";
+    };
+    if (expected.shape != got.shape) {
+        found.add_shape(where, described(expected), described(got));
+        return;
+    }
+    const auto listed = [](const numpy::Array<T, N>& array) {
+        const numpy::Array<T, N> whole = numpy::contiguous(array);
+        std::vector<std::conditional_t<std::is_same_v<T, bool>, std::uint8_t, T>> numbers(static_cast<std::size_t>(whole.size()));
+        if (!numbers.empty()) {
+            std::memcpy(numbers.data(), whole.data, numbers.size() * sizeof(T));
+        }
+        return numbers;
+    };
+    const std::vector<std::int64_t> shape(expected.shape.begin(), expected.shape.end());
+    compare_elements(listed(expected), listed(got), shape, tolerance, where, found);
+}
+
+{% endif %}
+template <class T>
 void compare(const std::optional<T>& expected, const std::optional<T>& got, const Tolerance& tolerance,
              const std::string& where, Difference& found);
 
@@ -347,7 +420,8 @@ template <class T>
 void compare(const std::vector<T>& expected, const std::vector<T>& got, const Tolerance& tolerance,
              const std::string& where, Difference& found) {
     if (expected.size() != got.size()) {
-        found.add_shape(where, std::to_string(expected.size()) + " items", std::to_string(got.size()) + " items");
+        found.add_shape(where, std::to_string(expected.size()) + " items",
+                std::to_string(got.size()) + " items");
         return;
     }
     for (std::size_t index = 0; index < expected.size(); ++index) {

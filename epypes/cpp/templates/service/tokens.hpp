@@ -1,4 +1,4 @@
-// @MARK@
+// @{mark}
 // The tokens of the graph: how events and answers carry them.
 #pragma once
 
@@ -10,15 +10,15 @@
 
 namespace service::tokens {
 
-using Graph = @NS@::Graph;
-using Hyperparameters = @NS@::Hyperparameters;
-using Inputs = @NS@::Inputs;
-using Outputs = @NS@::Outputs;
+using Graph = @{ns}::Graph;
+using Hyperparameters = @{ns}::Hyperparameters;
+using Inputs = @{ns}::Inputs;
+using Outputs = @{ns}::Outputs;
 
 /// Of the bundle that the graph was exported from.
-inline constexpr const char* bundle = @BUNDLE@;
-inline constexpr const char* digest = @DIGEST@;
-inline constexpr const char* epypes_version = @VERSION@;
+inline constexpr const char* bundle = @{settings.name | quoted};
+inline constexpr const char* digest = @{recording.bundle.digest | quoted};
+inline constexpr const char* epypes_version = @{epypes_version | quoted};
 
 extern const std::vector<std::string> inputs;
 extern const std::vector<std::string> outputs;
