@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from epypes.cpp import types as t
-from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, is_number, refuse, writable
+from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, is_number, refuse, writes
 
 _UFUNCS: Final[Mapping[type[ast.AST], str]] = {
     ast.Add: "add", ast.Sub: "subtract", ast.Mult: "multiply", ast.Div: "true_divide", ast.FloorDiv: "floor_divide",
@@ -36,8 +36,9 @@ def as_array(scope: Scope, given: Expr, node: Any) -> Expr:
 
 def made(dtype: str, ndim: int, channels: int = 0, operands: Sequence[Expr] = ()) -> t.Type:
     """Return the type of a new array; of no dimensions, of a number."""
-    is_strided = any(getattr(each.type, "is_strided", False) for each in operands)
-    return t.ArrayType(dtype, ndim, channels, is_mat=False, is_strided=is_strided) if ndim else t.number(dtype)
+    kinds = [each.type for each in operands if isinstance(each.type, t.ArrayType)]
+    is_other = any(kind.is_strided or kind.is_other for kind in kinds)
+    return t.ArrayType(dtype, ndim, channels, is_mat=False, is_other=is_other) if ndim else t.number(dtype)
 
 
 def dtype_of(given: Expr, node: Any) -> Any:
@@ -272,7 +273,7 @@ def subscript(scope: Scope, owner: Expr, part: ast.expr, node: Any) -> Expr:
             raise ByHand(f"a subscript by {t.describe(chosen)}", node)
         return Expr(
             f"numpy::take({array.text}, {selector.text})",
-            made(kind.dtype, ndim, kind.channels if ndim == kind.ndim == 3 else 0),
+            made(kind.dtype, ndim, kind.channels if ndim == kind.ndim == 3 else 0, [array]),
         )
     steps, ndim, is_element, keeps = _steps(scope, kind, part, node)
     if is_element:
@@ -289,7 +290,7 @@ def subscript(scope: Scope, owner: Expr, part: ast.expr, node: Any) -> Expr:
 
 def store(scope: Scope, owner: Expr, target: ast.Subscript, value: Expr, node: Any) -> None:
     """Assign to an element, a view or the elements of a mask."""
-    writable(owner, node)
+    writes(scope, owner, node)
     array = as_array(scope, owner, node)
     kind = array.type
     text = _stored(scope, kind, value, node)
@@ -342,7 +343,7 @@ def augmented(scope: Scope, left: Expr, operator: ast.operator, right: Expr, nod
     """Calculate in place, as `+=` does."""
     import numpy as np
 
-    writable(left, node)
+    writes(scope, left, node)
     found = binary(scope, operator, left, right, node)
     kind = left.type
     if not isinstance(kind, t.ArrayType) or not isinstance(found.type, t.ArrayType) or found.type.ndim != kind.ndim:

@@ -54,7 +54,8 @@ def written(value: Any, name: str, node: Any) -> Expr:
     if isinstance(value, np.ndarray) and value.dtype.name in t.ELEMENTS and 0 < value.size <= _MOST_ELEMENTS:
         element, shape = t.ELEMENTS[value.dtype.name], ", ".join(map(str, value.shape))
         numbers = ", ".join(t.literal(each, t.number(value.dtype.name)) for each in value.reshape(-1))
-        kind = t.ArrayType(value.dtype.name, value.ndim, is_mat=False, is_readonly=True)
+        own: Any = t.type_of(value)
+        kind = t.readonly(replace(own, is_mat=False, channels=0))
         return Expr(f"numpy::array<{element}, {value.ndim}>({{{shape}}}, {{{numbers}}})", kind)
     raise ByHand(f"the global {name!r} is a {type(value).__name__}", node)
 
@@ -157,6 +158,8 @@ def list_of(scope: Scope, parts: list[Expr], node: ast.expr) -> Expr:
     whole = t.ListType(kind, origin=origin)
     if kind == t.NONE:
         return Expr("{}", whole, parts=())
+    if isinstance(kind, t.ArrayType) and not kind.is_mat:
+        parts = [arrays.as_array(scope, part, node) for part in parts]
     return Expr(f"{whole.cpp}{{{', '.join(part.text for part in parts)}}}", whole, parts=tuple(parts))
 
 
@@ -411,13 +414,9 @@ def _if_exp(scope: Scope, node: Any) -> Expr:
     narrow_names(scope, node.test, is_true=False)
     other = scope.captured(lambda: value_of(scope, node.orelse))
     scope.env = saved
-    if (
-        isinstance(one.type, t.ArrayType)
-        and isinstance(other.type, t.ArrayType)
-        and one.type.is_mat != other.type.is_mat
-    ):
-        one, other = arrays.as_array(scope, one, node), arrays.as_array(scope, other, node)
     kind = joined(one.type, other.type, node)
+    if isinstance(kind, t.ArrayType) and not kind.is_mat:
+        one, other = arrays.as_array(scope, one, node), arrays.as_array(scope, other, node)
     if isinstance(kind, t.Int):
         kind = replace(kind, is_int=False)
         one, other = (side if side.type.cpp == "std::int64_t" else widened(side) for side in (one, other))
@@ -448,9 +447,7 @@ def _subscript(scope: Scope, node: Any) -> Expr:
         return parts[index.value]
     if isinstance(owner.type, t.ListType) and owner.type.item != t.NONE:
         scope.helpers.add("python")
-        item = owner.type.item
-        kind = replace(item, is_readonly=True) if isinstance(item, t.ArrayType) else item
-        return Expr(f"python::at({owner.text}, {index.text})", kind)
+        return Expr(f"python::at({owner.text}, {index.text})", owner.type.item)
     raise ByHand(f"an item of {t.describe(owner.type)}", node)
 
 

@@ -42,15 +42,9 @@ def iterate(scope: Scope, node: ast.expr, names: Sequence[str]) -> Iteration:
         name = _named(scope, given)
         item = scope.fresh(names[0] if len(names) == 1 else "item")
         reference = kind.item.cpp if isinstance(kind.item, t.Int | t.Plain) else f"{kind.item.cpp}&"
-        return Iteration(
-            f"for (const {reference} {item} : {name}) {{", lambda: Expr(item, _shared(kind.item), name=item)
-        )
+        return Iteration(f"for (const {reference} {item} : {name}) {{", lambda: Expr(item, kind.item, name=item))
     index, (head, (make,)) = scope.fresh("index"), _sequences(scope, [given], node)
     return Iteration(head.replace("@", index), lambda: make(index))
-
-
-def _shared(kind: t.Type) -> t.Type:
-    return replace(kind, is_readonly=True) if isinstance(kind, t.ArrayType) and kind.is_mat else kind
 
 
 def _named(scope: Scope, given: Expr) -> str:
@@ -114,7 +108,7 @@ def _sequence(scope: Scope, given: Expr, node: Any) -> tuple[str, Callable[[str]
     kind = given.type
     if isinstance(kind, t.ListType) and kind.item != t.NONE:
         name = _named(scope, given)
-        return f"{name}.size()", lambda index: Expr(f"{name}[{index}]", _shared(kind.item), name=f"{name}[]")
+        return f"{name}.size()", lambda index: Expr(f"{name}[{index}]", kind.item, name=f"{name}[]")
     refuse(not isinstance(kind, t.ArrayType), f"a loop over {t.describe(kind)}", node)
     rows = scope.hold("rows", arrays.as_array(scope, given, node))
     return f"{rows.text}.shape[0]", lambda index: arrays.row(rows.text, rows.type, index)
@@ -413,7 +407,7 @@ def _extreme(scope: Scope, given: Expr, name: str, options: Mapping[str, ast.exp
     item = given.type.item
     if "key" in options:
         key = _key(scope, options["key"], item)
-        return Expr(f"python::extreme({given.text}, {key}, {str(name == 'max').lower()})", _shared(item))
+        return Expr(f"python::extreme({given.text}, {key}, {str(name == 'max').lower()})", item)
     refuse(not isinstance(item, t.Int) and item != t.FLOAT, f"{name}() of {t.describe(given.type)}", node)
     if isinstance(item, t.Int) and given.parts:
         choose = min if name == "min" else max
@@ -456,7 +450,7 @@ def _key(scope: Scope, node: ast.expr, item: t.Type) -> str:
     name, body = node.args.args[0].arg, node.body
     saved, known, cpp = dict(scope.env), set(scope.locals), scope.fresh(name)
     scope.locals.add(name)
-    scope.env[name] = Binding(cpp, _shared(item))
+    scope.env[name] = Binding(cpp, item)
     found = scope.captured(lambda: value_of(scope, body))
     scope.env, scope.locals = saved, known
     refuse(not isinstance(found.type, t.Int) and found.type != t.FLOAT, f"a key that is {t.describe(found.type)}", node)

@@ -10,7 +10,7 @@ from typing import Any, Final
 from epypes.cpp import arrays
 from epypes.cpp import types as t
 from epypes.cpp.expressions import arguments, value_of
-from epypes.cpp.scope import ByHand, Expr, Scope, is_number, refuse, tuple_of
+from epypes.cpp.scope import ByHand, Expr, Scope, is_number, refuse, shares, tuple_of
 
 # Functions of each element that give the same bits in C++; others, as sin, have other last digits in NumPy's loops.
 _ELEMENTWISE: Final = frozenset(
@@ -82,7 +82,9 @@ def method(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
     )
     if name == "reshape" and len(given) != 1:
         given = [tuple_of(given)]
-    return _function(scope, name, [owner, *given], named, node)
+    found = _function(scope, name, [owner, *given], named, node)
+    # This copy alone has the usual layout.
+    return replace(found, type=replace(found.type, is_other=False)) if name == "copy" else found
 
 
 def _dtype(given: Expr | None, node: Any, default: str = "") -> str:
@@ -104,7 +106,7 @@ def _cast(scope: Scope, given: Expr, dtype: str, node: Any) -> Expr:
     if not isinstance(given.type, t.ArrayType):
         return Expr(f"numpy::cast<{t.ELEMENTS[dtype]}>({given.text})", t.number(dtype))
     array = arrays.as_array(scope, given, node)
-    kind = replace(array.type, dtype=dtype, is_readonly=False)
+    kind = arrays.made(dtype, array.type.ndim, array.type.channels, [array])
     return Expr(f"numpy::astype<{t.ELEMENTS[dtype]}>({array.text})", kind)
 
 
@@ -143,7 +145,7 @@ def _test(scope: Scope, name: str, given: Expr, node: Any) -> Expr:
     if not isinstance(given.type, t.ArrayType):
         return Expr(f"numpy::{name}({given.text})", t.number("bool"))
     array = arrays.as_array(scope, given, node)
-    return Expr(f"numpy::{name}({array.text})", replace(array.type, dtype="bool", is_readonly=False))
+    return Expr(f"numpy::{name}({array.text})", arrays.joint_type("bool", [array]))
 
 
 def _axis(given: Expr | None, ndim: int, node: Any) -> int | None:
@@ -168,7 +170,7 @@ def _reduced(scope: Scope, name: str, bound: Bound, node: Any) -> Expr:
         is_long = name != "sum" and kind.dtype in ("int64", "uint64", "uint32")
         refuse(is_long, f"the {name} of {kind.dtype}, which may have more digits than a double", node)
     refuse(
-        is_sum and is_float and kind.is_strided,
+        is_sum and is_float and (kind.is_strided or kind.is_other),
         "floats that may not lie side by side, which NumPy adds in another order",
         node,
     )
@@ -178,7 +180,7 @@ def _reduced(scope: Scope, name: str, bound: Bound, node: Any) -> Expr:
         is_plain = name == "count_nonzero" and type(np.count_nonzero(np.zeros(1))) is int  # type: ignore[comparison-overlap]
         return Expr(text, t.Int(0, 2**62) if is_plain else t.number(dtype))
     refuse(name not in ("sum", "mean", "min", "max"), f"{name} along an axis", node)
-    return Expr(f"numpy::{name}{template}({text}, {axis})", arrays.made(dtype, kind.ndim - 1))
+    return Expr(f"numpy::{name}{template}({text}, {axis})", arrays.made(dtype, kind.ndim - 1, operands=[array]))
 
 
 # -- functions ---------------------------------------------------------------------------------------------------------
@@ -200,11 +202,11 @@ def _channels(parts: Sequence[Expr]) -> int:
 
 def _full(value: str) -> Builder:
     def build(scope: Scope, bound: Bound, node: Any) -> Expr:
-        fill = bound.get("fill_value")
+        fill, like = bound.get("fill_value"), []
         if "a" in bound:
             array = arrays.as_array(scope, bound["a"], node)
             ndim, channels, shape = array.type.ndim, array.type.channels, f"{array.text}.shape"
-            dtype = _dtype(bound.get("dtype"), node, array.type.dtype)
+            dtype, like = _dtype(bound.get("dtype"), node, array.type.dtype), [array]
         else:
             parts = _shape(bound["shape"], node)
             ndim, channels, shape = len(parts), _channels(parts), f"{{{', '.join(part.text for part in parts)}}}"
@@ -213,7 +215,8 @@ def _full(value: str) -> Builder:
             is_float = fill.type == t.FLOAT and "float" not in dtype
             refuse(not is_number(fill.type) or is_float, f"{t.describe(fill.type)} in an array of {dtype}", node)
         text = f"static_cast<{t.ELEMENTS[dtype]}>({value})" if fill is None else _number(scope, fill, dtype, node)
-        return Expr(f"numpy::full<{t.ELEMENTS[dtype]}, {ndim}>({shape}, {text})", arrays.made(dtype, ndim, channels))
+        kind = arrays.made(dtype, ndim, channels, like)
+        return Expr(f"numpy::full<{t.ELEMENTS[dtype]}, {ndim}>({shape}, {text})", kind)
 
     return build
 
@@ -262,12 +265,14 @@ def _reshape(scope: Scope, bound: Bound, node: Any) -> Expr:
     array, parts = arrays.as_array(scope, bound["a"], node), _shape(bound["shape"], node)
     text = f"{array.text[:-1]}, true)" if array.text.startswith("numpy::from_rows<") else array.text
     # It may be a view or a copy: nothing writes to it.
+    shares(scope, array, node)
     kind = replace(array.type, ndim=len(parts), channels=_channels(parts), is_readonly=True)
     return Expr(f"numpy::reshape<{len(parts)}>({text}, {{{', '.join(part.text for part in parts)}}})", kind)
 
 
 def _ravel(scope: Scope, bound: Bound, node: Any) -> Expr:
     array = arrays.as_array(scope, bound["a"], node)
+    shares(scope, array, node)
     return Expr(f"numpy::ravel({array.text})", replace(array.type, ndim=1, channels=0, is_readonly=True))
 
 
@@ -293,7 +298,8 @@ def _where(scope: Scope, bound: Bound, node: Any) -> Expr:
 
 def _nonzero(scope: Scope, bound: Bound, node: Any) -> Expr:
     array = scope.hold("mask", arrays.as_array(scope, bound["a"], node))
-    kind = arrays.made("int64", 1)
+    # NumPy's are the columns of one array.
+    kind = t.ArrayType("int64", 1, is_mat=False, is_other=True)
     return tuple_of([Expr(f"numpy::nonzero<{axis}>({array.text})", kind) for axis in range(array.type.ndim)])
 
 
@@ -331,7 +337,7 @@ def _joined(axis: int | None = None, *, is_stack: bool = False) -> Builder:
 
 def _sort(scope: Scope, bound: Bound, node: Any) -> Expr:
     array = arrays.as_array(scope, bound["a"], node)
-    return Expr(f"numpy::sort({array.text})", replace(array.type, is_readonly=False))
+    return Expr(f"numpy::sort({array.text})", arrays.joint_type(array.type.dtype, [array]))
 
 
 def _argsort(scope: Scope, bound: Bound, node: Any) -> Expr:
@@ -369,8 +375,10 @@ def _same(scope: Scope, bound: Bound, node: Any) -> Expr:
     if not isinstance(kind, t.ArrayType) or _dtype(bound.get("dtype"), node, kind.dtype) != kind.dtype:
         return _array(scope, bound, node)
     array = arrays.as_array(scope, given, node)
-    is_asarray = ast.unparse(node.func).endswith("asarray")
-    return given if is_asarray else replace(array, text=f"numpy::contiguous({array.text})")
+    if ast.unparse(node.func).endswith("asarray"):
+        return given
+    shares(scope, array, node)
+    return replace(array, text=f"numpy::contiguous({array.text})")
 
 
 def _transposed(scope: Scope, bound: Bound, node: Any) -> Expr:

@@ -14,7 +14,7 @@ from importlib.resources import files
 from typing import Any, Final
 
 from epypes.cpp import types as t
-from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, refuse, tuple_of, writable
+from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, refuse, tuple_of, writes
 
 _INPUTS: Final = ("InputArray", "InputArrayOfArrays")
 _NUMBERS: Final[Mapping[str, t.Type]] = {
@@ -174,7 +174,7 @@ class _Call:
             # Its line stands before what else the statement evaluates.
             is_part = getattr(self.scope.statement, "value", None) is not self.node
             refuse(is_part, f"cv2.{self.name} changes {name!r} in a part of an expression", self.node)
-            writable(given, self.node)
+            writes(self.scope, given, self.node)
             self.outputs.append(given)
             return self._in_out(given)
         is_optional = "default" in arg or "mask" in name.lower() or name == "kernel"
@@ -372,10 +372,11 @@ def _input(scope: Scope, given: Expr, node: Any, *, is_optional: bool) -> str:
             scope.helpers.add("python")
             return f"python::required({given.text})"
         return given.text
-    if isinstance(own, t.ListType) and isinstance(own.item, t.ArrayType) and own.item.is_mat:
-        if given.parts is not None:
-            return f"std::vector<cv::Mat>{{{', '.join(part.text for part in given.parts)}}}"
-        return given.text
+    if given.parts and all(isinstance(part.type, t.ArrayType) for part in given.parts):
+        images = [_input(scope, part, node, is_optional=False) for part in given.parts]
+        return f"std::vector<cv::Mat>{{{', '.join(images)}}}"
+    if isinstance(own, t.ListType) and isinstance(own.item, t.ArrayType):
+        return _input(scope, replace(given, type=own.item), node, is_optional=False)
     if own == t.FLOAT or isinstance(own, t.Int):
         return f"cv::Scalar({given.text})"
     parts = items(given)

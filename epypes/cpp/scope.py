@@ -163,6 +163,9 @@ class Scope:
         self.helpers: set[str] = set()
         # By loop: the names where it is left, and where its next turn begins.
         self.loops: list[tuple[list[dict[str, Binding]], list[dict[str, Binding]]]] = []
+        # The dtypes of the arrays that are written to, and those of which a view in NumPy may be a copy in C++.
+        self.written: set[str] = set()
+        self.unsure: dict[str, Any] = {}
         self.is_dead = False
         self.statement: ast.stmt | None = None
 
@@ -373,10 +376,17 @@ def is_number(kind: t.Type) -> bool:
     return isinstance(kind, t.Int) or kind in (t.FLOAT, t.BOOL) or (isinstance(kind, t.Plain) and bool(kind.dtype))
 
 
-def writable(array: Expr, node: Any) -> None:
-    """Raise ByHand for an array whose memory may be that of an argument."""
-    if isinstance(array.type, t.ArrayType) and array.type.is_readonly:
-        raise ByHand("it writes to an argument, which is read-only in Python", node)
+def writes(scope: Scope, array: Expr, node: Any) -> None:
+    """Note that an array is written to; raise ByHand if its memory may be that of an argument."""
+    if isinstance(array.type, t.ArrayType):
+        refuse(array.type.is_readonly, "it writes to an argument, which is read-only in Python", node)
+        scope.written.add(array.type.dtype)
+
+
+def shares(scope: Scope, array: Expr, node: Any) -> None:
+    """Note that an array is made which shares memory with another one, or not, as the layout is."""
+    if isinstance(array.type, t.ArrayType) and array.type.is_other:
+        scope.unsure[array.type.dtype] = node
 
 
 def tuple_of(parts: Sequence[Expr]) -> Expr:

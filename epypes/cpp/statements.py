@@ -7,7 +7,7 @@ import builtins
 import copy
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 from epypes.cpp import arrays, opencv
@@ -97,6 +97,10 @@ def function(
                 continue  # the next round knows what is in a list
             raise
         refuse(not scope.is_dead, "it may end without a return", node)
+        for dtype, place in scope.unsure.items():
+            # Who calls another function of the user may write to what that one returns.
+            is_written = wanted is None or scope.written & {dtype, ""}
+            refuse(is_written, f"NumPy may make a view where C++ makes a copy, and writes to {dtype}", place)
         if wanted is None:
             kind = scope.returns[0] if scope.returns else t.NONE
             for other in scope.returns[1:]:
@@ -181,12 +185,8 @@ def _begin(scope: Scope, given: Mapping[str, t.Type]) -> Mapping[str, str]:
         if kind == t.NONE:
             scope.env[name] = Binding("{}", t.NONE, None, None)
             continue
-        if isinstance(kind, t.ArrayType):
-            kind = replace(kind, is_readonly=True)
-        if isinstance(kind, t.ListType) and isinstance(kind.item, t.ArrayType):
-            kind = replace(kind, item=replace(kind.item, is_readonly=True))
         cpp_names[name] = scope.fresh(name)
-        scope.env[name] = Binding(cpp_names[name], kind)
+        scope.env[name] = Binding(cpp_names[name], t.readonly(kind))
     for name, kind in given.items():
         if name in scope.stored and kind != t.NONE and not scope.is_simple(name):
             bound = scope.env[name]
@@ -331,9 +331,7 @@ def unpacked(scope: Scope, value: Expr, count: int, node: Any) -> Sequence[Expr]
         if not value.name:
             name = scope.hold("items", value).text
         scope.emit(f"python::check_size({name}, {count});")
-        item = value.type.item
-        item = replace(item, is_readonly=True) if isinstance(item, t.ArrayType) else item
-        return [Expr(f"{name}[{index}]", item) for index in range(count)]
+        return [Expr(f"{name}[{index}]", value.type.item) for index in range(count)]
     refuse(len(parts) != count, f"{count} names for {t.describe(value.type)}", node)
     if value.parts is None and not value.name and isinstance(value.type, t.TupleType):
         return opencv.items(scope.hold("items", value))

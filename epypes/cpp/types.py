@@ -119,7 +119,7 @@ def number(dtype: str) -> Plain:
 
 
 _FLOATS: Final = (number("float32"), number("float64"))
-_FLAGS: Final = ("is_readonly", "is_nullable", "is_strided")
+_FLAGS: Final = ("is_readonly", "is_nullable", "is_strided", "is_other")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +142,8 @@ class ArrayType(Type):
         Whether it may be None, which is an empty cv::Mat.
     is_strided
         Whether the elements may lie in another order, in which NumPy adds floats, or apart.
+    is_other
+        Whether they may lie otherwise in C++ than in NumPy, which keeps the order of a transposed operand.
     """
 
     dtype: str = ""
@@ -151,6 +153,7 @@ class ArrayType(Type):
     is_readonly: bool = False
     is_nullable: bool = False
     is_strided: bool = False
+    is_other: bool = False
 
     @property
     def cpp(self) -> str:
@@ -295,7 +298,8 @@ def type_of(value: Any) -> Type:
     if kind.__name__ != "ndarray":
         return number(dtype.name)
     array = array_type(dtype.name, value.ndim, value.shape[-1] if value.ndim == 3 else 0)
-    return replace(array, is_strided=not value.flags.c_contiguous)
+    is_strided = not value.flags.c_contiguous
+    return replace(array, is_strided=is_strided, is_other=is_strided)
 
 
 def _of_sequence(items: list[Type], *, is_tuple: bool) -> Type:
@@ -314,6 +318,15 @@ def kept(kind: Type) -> Type:
     if isinstance(kind, Int):
         return Int()
     return TupleType(tuple(map(kept, kind.items))) if isinstance(kind, TupleType) else kind
+
+
+def readonly(kind: Type) -> Type:
+    """Return the type of a value whose arrays nothing may write to."""
+    if isinstance(kind, ArrayType):
+        return replace(kind, is_readonly=True)
+    if isinstance(kind, ListType):
+        return replace(kind, item=readonly(kind.item))
+    return TupleType(tuple(map(readonly, kind.items))) if isinstance(kind, TupleType) else kind
 
 
 def join(left: Type, right: Type) -> Type:
@@ -341,7 +354,7 @@ def join(left: Type, right: Type) -> Type:
         return ListType(join(left.item, right.item), left.is_tuple)
     if isinstance(left, TupleType) and isinstance(right, TupleType) and len(left.items) == len(right.items):
         return TupleType(tuple(join(*pair) for pair in zip(left.items, right.items, strict=True)))
-    if isinstance(left, ArrayType) and isinstance(right, ArrayType) and left.is_mat == right.is_mat:
+    if isinstance(left, ArrayType) and isinstance(right, ArrayType):
         return _join_arrays(left, right)
     if all(isinstance(side, Int) or side in (FLOAT, MIXED, *_FLOATS) for side in (left, right)):
         return MIXED
@@ -350,10 +363,12 @@ def join(left: Type, right: Type) -> Type:
 
 def _join_arrays(left: ArrayType, right: ArrayType) -> ArrayType:
     dtype, ndim = left.dtype if left.dtype == right.dtype else "", left.ndim if left.ndim == right.ndim else -1
-    if not left.is_mat and (not dtype or ndim < 0):
+    # An array of C++ shares the memory of a cv::Mat, which can't share that of any array.
+    is_mat = left.is_mat and right.is_mat
+    if not is_mat and (not dtype or ndim < 0):
         raise TypeError(f"{describe(left)} and {describe(right)}")
     flags = (getattr(left, name) or getattr(right, name) for name in _FLAGS)
-    return ArrayType(dtype, ndim, left.channels if left.channels == right.channels else 0, left.is_mat, *flags)
+    return ArrayType(dtype, ndim, left.channels if left.channels == right.channels else 0, is_mat, *flags)
 
 
 def describe(kind: Type) -> str:

@@ -820,6 +820,66 @@ def returned_views(image):
     return left, right
 
 
+def views_in_lists(image):
+    own = image.copy()
+    views = [own[::-1], own[:, ::-1]]
+    views.append(cv2.blur(own, (3, 3)))
+    own[0] = 9
+    for view in views:
+        view[1, 1] = 7
+    for part in [own[:2], own[2:]]:
+        cv2.rectangle(part, (1, 0), (2, 0), 200, -1)
+    views[0][2, 2] = 5
+    return cv2.hconcat(views), cv2.vconcat([own[::-1], own[::2], views[1]]), own
+
+
+def listed_views(array):
+    return [array[::-1], cv2.blur(array, (3, 3))]
+
+
+def views_of_helper(image):
+    own = image.copy()
+    views = listed_views(own)
+    own[0] = 9
+    one, other = views
+    return one, cv2.hconcat(views), other
+
+
+def reshaped_columns(image):
+    own = image.copy()
+    column, pairs, apart, row = own[:, 0].reshape(-1, 1), own[:2, ::2].reshape(2, 1, -1), own[::2].reshape(-1), own[:, 1].ravel()
+    own[0] = 99
+    return column, pairs[:, 0], apart, row
+
+
+def calculated_of_transposed(image):
+    turned = image.T + 1
+    flat, whole = turned.reshape(-1), image.T.copy().ravel()
+    return flat, np.ascontiguousarray(turned), whole, np.zeros_like(image.T)
+
+
+def written_after_transposed(image):
+    turned = image.T.astype(np.int32)
+    flat = turned.ravel()
+    turned[0, 1] = 99
+    return flat
+
+
+def written_after_nonzero(image):
+    rows, columns = np.nonzero(image > 9)
+    flat = rows.ravel()
+    rows[0] = 99
+    return flat
+
+
+def nested_input_in_place(groups):
+    for group in groups:
+        for values in group:
+            if len(groups) > 5:
+                values[0] = 1
+    return groups[0][0]
+
+
 def array_in_two_names(image):
     own = np.zeros_like(image)
     other = own
@@ -1041,6 +1101,13 @@ INPUTS: dict[str, list[tuple[Any, ...]]] = {
     "swapped_rows": _IMAGES,
     "swapped_elements": _LISTS,
     "returned_views": _IMAGES,
+    "views_in_lists": _IMAGES,
+    "views_of_helper": _IMAGES,
+    "reshaped_columns": _IMAGES,
+    "calculated_of_transposed": _IMAGES,
+    "written_after_transposed": _IMAGES,
+    "written_after_nonzero": _IMAGES,
+    "nested_input_in_place": [([[_GRID[0], _GRID[1]]],)],
     "array_in_two_names": _IMAGES,
     "appended_rows": _IMAGES,
     "filled_in_helper": _IMAGES,

@@ -30,23 +30,24 @@ RAISES = ("growing",)
 # What many graphs have. Others have several items, of which one has no translation.
 TRANSLATED = [
     "argument_of_either_sign", "array_division", "astype_wraps", "augmented_float", "backwards", "bits",
-    "boxes_of_contours", "centre_of_mass", "chained", "changed_bound", "changed_loop_variable", "channels", "circles",
+    "boxes_of_contours", "calculated_of_transposed", "centre_of_mass", "chained", "changed_bound", "changed_loop_variable", "channels", "circles",
     "cleaned", "clipped_to_nan", "compared_out_of_range", "compared_sums", "compared_types", "components", "contours",
     "corner_points", "cut_out", "drawn_boxes", "drifting", "drifting_branch", "drifting_while", "early_return", "empty", "enclosing_circle",
     "float_floor_division", "focus_map", "forever", "from_above", "growing", "half_size", "hough_lines", "integers_of_pixels",
     "iou", "keywords", "large", "last_of_loop", "masked_assignment", "matched_template", "minus_of_sum",
     "moving_threshold", "negative_index", "numbers_of_int64", "outputs_of_opencv", "overflow_uint8", "overlapping",
-    "polygon_corners", "promoted", "reshaped", "returned_views", "rotated", "rounded", "row_of_copy", "saturated",
+    "polygon_corners", "promoted", "reshaped", "reshaped_columns", "returned_views", "rotated", "rounded", "row_of_copy", "saturated",
     "scalars_of_numpy", "shape_and_size", "share_of_colour", "sharpness", "shifts", "slices", "straight_parts",
     "sum_of_bools",
     "sum_of_mask", "sum_of_uint8", "sums_of_columns", "swapped", "ternary_of_two_types", "true_division",
-    "truncated_points", "truth", "two_lists", "unsharp", "view_in_place", "views", "where_mixed", "white_pixels",
+    "truncated_points", "truth", "two_lists", "unsharp", "view_in_place", "views", "views_in_lists", "views_of_helper", "where_mixed", "white_pixels",
 ]  # fmt: skip
 # What C++ would do otherwise without a word.
 BY_HAND = [
     "chained_once", "drawn_meanwhile", "late_binding", "list_chosen", "list_given_back", "list_grows_in_its_loop",
-    "list_in_list", "nested_function", "order_of_arguments", "order_of_calls", "raised", "recursive",
+    "list_in_list", "nested_function", "nested_input_in_place", "order_of_arguments", "order_of_calls", "raised", "recursive",
     "returns_none", "same_list", "shadowed_builtin", "short_circuit", "sorted_with_ties", "unbound_after_branch",
+    "written_after_nonzero", "written_after_transposed",
 ]  # fmt: skip
 
 

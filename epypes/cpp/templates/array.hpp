@@ -304,6 +304,16 @@ cv::Mat mat(const Array<T, N>& given) {
     return image;
 }
 
+/// Arrays as images that OpenCV reads.
+template <class T, int N>
+std::vector<cv::Mat> mat(const std::vector<Array<T, N>>& arrays) {
+    std::vector<cv::Mat> images;
+    for (const Array<T, N>& array : arrays) {
+        images.push_back(mat(array));
+    }
+    return images;
+}
+
 /// An array as an image that OpenCV writes to.
 template <class T, int N>
 cv::Mat in_out(const Array<T, N>& array) {
@@ -587,7 +597,48 @@ Array<T, M> view(const Array<T, N>& array, std::initializer_list<Step> steps) {
     return made;
 }
 
-/// The same memory in another shape if the elements lie side by side, else a copy; one size may be -1.
+/// The strides of the same memory in another shape, as NumPy finds them; whether there are any.
+template <int M, class T, int N>
+bool find_strides(const Array<T, N>& array, const Shape<M>& shape, Shape<M>& strides) {
+    std::vector<Size> sizes;
+    std::vector<Size> steps;
+    for (int axis = 0; axis < N; ++axis) {
+        if (array.shape[axis] != 1) {
+            sizes.push_back(array.shape[axis]);
+            steps.push_back(array.strides[axis]);
+        }
+    }
+    std::size_t source = 0;
+    int target = 0;
+    while (target < M && source < sizes.size()) {
+        // The axes of both that have as many elements.
+        std::size_t source_end = source + 1;
+        int target_end = target + 1;
+        Size before = sizes[source];
+        Size after = shape[target];
+        while (before != after) {
+            before < after ? before *= sizes[source_end++] : after *= shape[target_end++];
+        }
+        for (std::size_t axis = source; axis + 1 < source_end; ++axis) {
+            if (steps[axis] != sizes[axis + 1] * steps[axis + 1]) {
+                return false;
+            }
+        }
+        Size step = steps[source_end - 1];
+        for (int axis = target_end - 1; axis >= target; --axis) {
+            strides[axis] = step;
+            step *= shape[axis];
+        }
+        source = source_end;
+        target = target_end;
+    }
+    for (; target < M; ++target) {
+        strides[target] = target > 0 ? strides[target - 1] : static_cast<Size>(sizeof(T));
+    }
+    return true;
+}
+
+/// The same memory in another shape where strides say it, else a copy; one size may be -1.
 template <int M, class T, int N>
 Array<T, M> reshape(const Array<T, N>& array, Shape<M> shape) {
     Size known = 1;
@@ -602,12 +653,17 @@ Array<T, M> reshape(const Array<T, N>& array, Shape<M> shape) {
             each = array.size() / known;
         }
     }
-    const Array<T, N> source = contiguous(array);
     Array<T, M> made;
     made.shape = shape;
     if (made.size() != array.size()) {
         throw std::invalid_argument("cannot reshape array");
     }
+    if (!array.is_contiguous() && array.size() > 1 && find_strides<M>(array, shape, made.strides)) {
+        made.data = array.data;
+        made.owner = array.owner;
+        return made;
+    }
+    const Array<T, N> source = contiguous(array);
     made.data = source.data;
     made.owner = source.owner;
     Size step = sizeof(T);
@@ -620,7 +676,7 @@ Array<T, M> reshape(const Array<T, N>& array, Shape<M> shape) {
 
 template <class T, int N>
 Array<T, 1> ravel(const Array<T, N>& array) {
-    return reshape<1>(array, {array.size()});
+    return reshape<1>(contiguous(array), {array.size()});
 }
 
 template <class T, int N>
