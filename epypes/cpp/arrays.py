@@ -297,14 +297,11 @@ def store(scope: Scope, owner: Expr, target: ast.Subscript, value: Expr, node: A
     selector = _selector(scope, target.slice, node)
     if selector is not None:
         chosen = selector.type
-        is_whole = isinstance(chosen, t.ArrayType) and chosen.ndim == kind.ndim
-        if (
-            not isinstance(chosen, t.ArrayType)
-            or chosen.dtype != "bool"
-            or (value.parts is not None and not is_whole)
-            or (isinstance(value.type, t.ArrayType) and not (is_whole and value.type.ndim == 1))
-        ):
-            raise ByHand(f"an assignment to the elements that {t.describe(chosen)} selects", node)
+        assert isinstance(chosen, t.ArrayType)  # noqa: S101 - for the type checker
+        rank = value.type.ndim if isinstance(value.type, t.ArrayType) else int(value.parts is not None)
+        # A number, the elements in their order, or a row for each row.
+        is_sure = chosen.dtype == "bool" and (rank == 0 or (rank == 1 and kind.ndim - chosen.ndim < 2))
+        refuse(not is_sure, f"an assignment to the elements that {t.describe(chosen)} selects", node)
         scope.emit(f"numpy::put({array.text}, {selector.text}, {text});")
         return
     steps, ndim, is_element, _ = _steps(scope, kind, target.slice, node)

@@ -222,6 +222,9 @@ def for_statement(scope: Scope, node: ast.For, returned: t.Type | None) -> None:
         ast.unparse(each.value) for each in ast.walk(node) if isinstance(each, ast.Attribute) and each.attr == "append"
     }
     refuse(over & grown, "a loop changes the list that it goes over", node)
+    empty = scope.env.get(getattr(node.iter, "id", ""))
+    if empty is not None and isinstance(empty.type, t.ListType) and empty.type.item == t.NONE and empty.type.origin[0]:
+        return  # it is empty until the next round knows what is added to it
     is_local = is_loops_own(scope, names)
     iteration = iterate(scope, node.iter, names if is_local else ())
 
@@ -377,14 +380,15 @@ def _int(scope: Scope, given: Expr, node: Any) -> Expr:
     whole = _whole(given)
     if isinstance(whole.type, t.Int):
         return whole
-    refuse(not is_number(given.type), f"int() of {t.describe(given.type)}", node)
+    refuse(not is_number(given.type) and given.type != t.MIXED, f"int() of {t.describe(given.type)}", node)
     name = "narrow<std::int64_t>" if given.type.dtype == "uint64" else "integer"
     return Expr(f"python::{name}({given.text})", t.Int())
 
 
 def _float(scope: Scope, given: Expr, node: Any) -> Expr:
-    refuse(not is_number(given.type), f"float() of {t.describe(given.type)}", node)
-    return given if given.type == t.FLOAT else Expr(f"static_cast<double>({given.text})", t.FLOAT)
+    refuse(not is_number(given.type) and given.type != t.MIXED, f"float() of {t.describe(given.type)}", node)
+    is_double = given.type in (t.FLOAT, t.MIXED)
+    return replace(given, type=t.FLOAT) if is_double else Expr(f"static_cast<double>({given.text})", t.FLOAT)
 
 
 def _abs(scope: Scope, given: Expr, node: Any) -> Expr:
@@ -408,6 +412,12 @@ def _extreme(scope: Scope, given: Expr, name: str, options: Mapping[str, ast.exp
     if "key" in options:
         key = _key(scope, options["key"], item)
         return Expr(f"python::extreme({given.text}, {key}, {str(name == 'max').lower()})", item)
+    if item == t.MIXED and given.parts:
+        # What it is in Python depends on which one is chosen; as a number both are the same.
+        is_large = any(isinstance(part.type, t.Int) and not part.type.is_within(53) for part in given.parts)
+        refuse(is_large, "a float beside an integer of more than 53 bits", node)
+        texts = [_float(scope, part, node).text for part in given.parts]
+        return Expr(f"python::{name}(std::vector<double>{{{', '.join(texts)}}})", item)
     refuse(not isinstance(item, t.Int) and item != t.FLOAT, f"{name}() of {t.describe(given.type)}", node)
     if isinstance(item, t.Int) and given.parts:
         choose = min if name == "min" else max

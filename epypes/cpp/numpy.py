@@ -229,10 +229,7 @@ def _array(scope: Scope, bound: Bound, node: Any) -> Expr:
         return _cast(scope, given, wanted or given.type.dtype, node)
     if isinstance(given.type, t.ListType) and not given.parts:
         return _of_list(scope, given, wanted, node)
-    rows = [part.parts for part in given.parts or ()]
-    lengths = {len(row) for row in rows if row is not None}
-    is_nested = len(lengths) == 1 and None not in rows
-    flat = [item for row in rows for item in row or ()] if is_nested else [*(given.parts or ())]
+    shape, flat = _nested(given, node)
     refuse(
         not flat or not all(is_number(item.type) for item in flat), "an array of what is not written as numbers", node
     )
@@ -240,10 +237,18 @@ def _array(scope: Scope, bound: Bound, node: Any) -> Expr:
     refuse(dtype not in t.ELEMENTS, f"an array of {dtype}", node)
     is_cast = any(item.type.dtype and not np.can_cast(item.type.dtype, dtype, "same_kind") for item in flat)
     refuse(is_cast, f"numbers of NumPy in an array of {dtype}", node)
-    shape = [len(rows), lengths.pop()] if is_nested else [len(flat)]
     numbers = ", ".join(_number(scope, item, dtype, node) for item in flat)
     text = f"numpy::array<{t.ELEMENTS[dtype]}, {len(shape)}>({{{', '.join(map(str, shape))}}}, {{{numbers}}})"
-    return Expr(text, arrays.made(dtype, len(shape)))
+    return Expr(text, arrays.made(dtype, len(shape), shape[2] if len(shape) == 3 else 0))
+
+
+def _nested(given: Expr, node: Any) -> tuple[tuple[int, ...], list[Expr]]:
+    """Return the shape of an array that is written out, and its numbers."""
+    if given.parts is None:
+        return (), [given]
+    inner = [_nested(part, node) for part in given.parts]
+    refuse(len({shape for shape, _ in inner}) != 1, "an array of rows of different lengths, or of none", node)
+    return (len(inner), *inner[0][0]), [number for _, numbers in inner for number in numbers]
 
 
 def _of_list(scope: Scope, given: Expr, wanted: str, node: Any) -> Expr:

@@ -42,9 +42,14 @@ def tuples() -> Mapping[str, Mapping[str, str]]:
 
 
 def constant(name: str) -> str | None:
-    """Return the C++ name of a constant of cv2."""
-    found: str | None = table()["constants"].get(name)
-    return found
+    """Return the C++ name of a constant of cv2, which Python also has in capitals."""
+    return _constants().get(name)
+
+
+@functools.cache
+def _constants() -> Mapping[str, str]:
+    found: Mapping[str, str] = table()["constants"]
+    return {**{name.upper(): text for name, text in found.items()}, **found}
 
 
 def overloads(name: str, owner: str = "") -> Sequence[Mapping[str, Any]]:
@@ -168,6 +173,9 @@ class _Call:
         if given.value is None and kind in tuples():
             # Python's binding leaves the default.
             return None if "default" in arg else f"cv::{kind}()"
+        index = len(self.outputs) + (self.signature["returns"] not in ("void", ""))
+        if direction == "inout" and given.value is None and self._rule(index):
+            return self._output("OutputArray", name)
         if direction == "inout":
             if kind != "InputOutputArray" or given.value is None:
                 raise ByHand(f"cv2.{self.name} changes {name!r}, which is not translated", self.node)
@@ -231,7 +239,8 @@ class _Call:
         if not rule:
             return unknown
         dtype, ndim, channels = rule.get("dtype", ""), rule.get("ndim", -1), rule.get("channels", 0)
-        first = next((self.bound[name] for name in self.signature["py"] if name in self.bound), None)
+        named = [rule["like"]] if isinstance(rule.get("like"), str) else self.signature["py"]
+        first = next((self.bound[name] for name in named if name in self.bound), None)
         source = first.type if first is not None else t.NONE
         if isinstance(source, t.ListType):
             channels = len(first.parts or ()) if first is not None and rule.get("count") else channels
@@ -305,7 +314,7 @@ def converted(scope: Scope, given: Expr, kind: str, node: Any, *, is_optional: b
     if kind in _INPUTS:
         return _input(scope, given, node, is_optional=is_optional)
     if kind in ("double", "float"):
-        if own in (t.FLOAT, t.BOOL) or isinstance(own, t.Int) or (is_numpy and own.dtype != "bool"):
+        if own in (t.FLOAT, t.BOOL, t.MIXED) or isinstance(own, t.Int) or (is_numpy and own.dtype != "bool"):
             return f"static_cast<float>({given.text})" if kind == "float" and given.value is UNKNOWN else given.text
     elif kind in ("int", "bool") and (isinstance(own, t.Int) or own == t.BOOL or (is_numpy and "int" in own.dtype)):
         if kind == "bool":

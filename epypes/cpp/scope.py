@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import packages_distributions
 from typing import Any, Final
@@ -140,7 +141,8 @@ class Scope:
     functions
         Returns the C++ name and the return type of another function of the user for the types of its arguments.
     refined
-        The types of items of lists that begin empty, by the place of the list; filled while it is translated.
+        The types of items of lists that begin empty, by the place of the list, and of the variables that are an array
+        of C++ in one branch and a cv::Mat in another, by name; filled while it is translated.
     """
 
     def __init__(
@@ -148,7 +150,7 @@ class Scope:
         node: ast.FunctionDef,
         names: Mapping[str, Any],
         functions: Callable[[Any, Sequence[t.Type], ast.AST], tuple[str, t.Type]],
-        refined: dict[tuple[int, int], t.Type],
+        refined: dict[tuple[int, int] | str, t.Type],
     ) -> None:
         self.node, self.names, self.functions, self.refined = node, names, functions, refined
         self.block = self.body = Block()
@@ -289,6 +291,11 @@ class Scope:
             return
         if isinstance(kind, t.Int):
             kind = replace(kind, is_int=False)
+        if name in self.refined and isinstance(kind, t.ArrayType) and kind.is_mat:
+            from epypes.cpp.arrays import as_array
+
+            value = as_array(self, value, node)
+            kind = value.type
         variable = self.variables.get((name, kind.cpp))
         if variable is None:
             variable = self.variables[name, kind.cpp] = Variable(self.fresh(name), kind.cpp)
@@ -308,6 +315,10 @@ class Scope:
         for name in dict.fromkeys(name for end in ends for name in end):
             found = [end[name] for end in ends if name in end]
             merged[name] = _merged(found, len(found) == len(ends))
+            kinds = [each.type for each in found]
+            if len(kinds) == len(ends) and {getattr(kind, "is_mat", None) for kind in kinds} == {True, False}:
+                with suppress(TypeError):
+                    self.refined[name] = functools.reduce(t.join, kinds)
         self.env = merged
 
     def declare(self) -> list[str]:

@@ -84,7 +84,7 @@ def function(
     """
     node, imported = _without_imports(node, names)
     _check(node)
-    refined: dict[tuple[int, int], t.Type] = {}
+    refined: dict[tuple[int, int] | str, t.Type] = {}
     returned = wanted
     for _ in range(_ROUNDS):
         before = dict(refined), returned
@@ -278,17 +278,22 @@ def _assign(scope: Scope, node: Any, returned: t.Type | None) -> None:
     if node.value is None:
         return  # an annotation
     targets = getattr(node, "targets", None) or [node.target]
-    refuse(len(targets) != 1, "an assignment to several names", node)
     target = targets[0]
     hint: tuple[str, ...] = ()
     if isinstance(target, ast.Name):
         hint = (target.id,)
     elif isinstance(target, ast.Tuple) and all(isinstance(each, ast.Name) for each in target.elts):
         hint = tuple(ast.unparse(each) for each in target.elts)
-    if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple) and len(target.elts) == len(node.value.elts):
+    is_row = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple) and len(targets) == 1
+    if is_row and len(target.elts) == len(node.value.elts):
         _assign_each(scope, target, node.value, node)
         return
-    _store(scope, target, translate(scope, node.value, hint), node)
+    value = translate(scope, node.value, hint)
+    if len(targets) > 1:
+        refuse(isinstance(value.type, t.ListType | t.TupleType), "several names for a list or a tuple", node)
+        value = value if value.value is not UNKNOWN else scope.hold("value", value)
+    for each in targets:
+        _store(scope, each, value, node)
 
 
 def _assign_each(scope: Scope, target: Any, value: Any, node: Any) -> None:

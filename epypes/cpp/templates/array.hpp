@@ -763,22 +763,13 @@ Array<T, N> take(const Array<T, N>& array, const Array<I, 1>& indices) {
     return taken(array, found);
 }
 
-/// Writes a number to the elements where a mask is true, or the elements of an array in their order.
+/// Writes to the elements where a mask is true: a number, the elements of an array in their order, or a row to each row.
 template <class T, int N, int M, class V>
 void put(const Array<T, N>& array, const Array<bool, M>& mask, const V& values) {
     check_mask(array, mask);
-    if constexpr (Traits<V>::rank == 0) {
-        Array<bool, N> wide;
-        wide.data = mask.data;
-        wide.shape = array.shape;
-        std::copy(mask.strides.begin(), mask.strides.end(), wide.strides.begin());
-        for_each<N>(array.shape,
-                [&](const T& place,
-                bool is_set) { is_set ? void(const_cast<T&>(place) = cast<T>(values)) : void(); },
-                    Operand<T, N>{array.data, array.strides}, Operand<bool, N>{wide.data, wide.strides});
-    } else {
-        static_assert(M == N && Traits<V>::rank == 1);
-        const auto source = copy(values);
+    // What is written may overlap with what is read.
+    const auto source = astype<typename Traits<V>::Element>(values);
+    if constexpr (M == N && Traits<V>::rank == 1) {
         const std::vector<Size> found = places(mask);
         if (source.size() != 1 && source.size() != static_cast<Size>(found.size())) {
             throw std::invalid_argument("NumPy boolean array indexing assignment: other number of values");
@@ -791,6 +782,15 @@ void put(const Array<T, N>& array, const Array<bool, M>& mask, const V& values) 
                 next += step;
             }
         }, Operand<T, N>{array.data, array.strides}, Operand<bool, N>{mask.data, mask.strides});
+    } else {
+        static_assert(Traits<V>::rank <= N - M);
+        Operand<bool, N> wide{mask.data, {}};
+        std::copy(mask.strides.begin(), mask.strides.end(), wide.strides.begin());
+        for_each<N>(array.shape, [](const T& place, bool is_set, const auto& value) {
+            if (is_set) {
+                const_cast<T&>(place) = cast<T>(value);
+            }
+        }, Operand<T, N>{array.data, array.strides}, wide, stretched<N>(source, array.shape));
     }
 }
 
