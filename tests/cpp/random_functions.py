@@ -72,6 +72,8 @@ class Writer:
         self.count = 0
         self.indent = 1
         self.in_loop = False
+        # Views of arrays that are written to later.
+        self.views: list[str] = []
         # What few people write, and has no translation: in few functions, since one such place is enough.
         self.is_odd = rng.random() < 0.15
         self.depth = rng.choice((1, 1, 2, 2, 3))
@@ -551,6 +553,13 @@ class Writer:
             name, kind = found
             view = f"part{self.fresh()}"
             self.emit(f"{view} = {name}[{self.one('1:', ':, 1:', '::2', '0:2, 1:')}]")
+            other = self.one("[::-1]", ".T", ".T + 1", "[:, ::2]", ".astype(np.int32)", "")
+            shape = self.one("", "", ".reshape(-1)", ".ravel()", "[:, 0].reshape(-1, 1)", ".reshape(1, -1, 1)")
+            listed = self.one(
+                f"{view}s = [({name}{other}){shape}]", f"{view}s = [{name}{other}, {name}]", f"{view}s = [{view}]"
+            )
+            self.emit(listed)
+            self.views.append(f"{view}s[0]")
             self.emit(
                 self.one(f"{view} += {self.literal(kind)}", f"{view}[0] = {self.literal(kind)}", f"{name}[1] = 5")
             )
@@ -560,6 +569,7 @@ class Writer:
     def returned(self) -> list[str]:
         kept = [name for names in self.names.values() for name in names]
         chosen = self.rng.sample(kept, min(len(kept), 3))
+        chosen += self.views
         array = self.some_array()
         if array:
             name, kind = array
