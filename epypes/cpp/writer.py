@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -15,7 +16,6 @@ from epypes import __version__
 from epypes.cpp import types as t
 from epypes.cpp.project import CppFunction, Project
 from epypes.cpp.samples import write_sample
-from epypes.cpp.service import entries, reading, writing
 from epypes.errors import BundleError
 from epypes.optional import optional_import
 
@@ -26,6 +26,9 @@ MARK: Final = "Written by EPypes from the bundle"
 BY_HAND: Final = "by_hand.cpp"
 _SERVICE: Final = "service/"
 _WIDTH: Final = 110
+# The methods of Reader and Writer for numbers and texts of Python, and for lists of records of OpenCV.
+_READERS: Final = {"double": "number", "bool": "boolean", "str": "text", "None": "none"}
+_RECORDS: Final = {"KeyPoint": "keypoints", "DMatch": "matches"}
 # A function as it is added to the file: nothing in it is by hand yet.
 _STUB: Final = re.compile(
     r"\nnamespace \w+ \{\n\n// By hand: [^\n]*\n(?://[^\n]*\n)*[^\n]*\{\n"
@@ -86,7 +89,6 @@ def _templates(project: Project) -> Environment:
     """Return the templates, in which an expression is @{...}, since C++ has {{ }} of its own."""
     with optional_import():
         import jinja2
-    settings = project.recording.bundle.settings
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("epypes.cpp"), undefined=jinja2.StrictUndefined, autoescape=False,  # noqa: S701
         keep_trailing_newline=True, trim_blocks=True, lstrip_blocks=True,
@@ -94,9 +96,11 @@ def _templates(project: Project) -> Environment:
     )  # fmt: skip
     templates.filters |= {
         "quoted": t.quoted, "json": json.dumps, "one_line": _one_line, "wrapped": _wrapped, "initial": _initial,
-        "head_without_names": _head_without_names, "reading": functools.partial(reading, settings),
-        "writing": functools.partial(writing, settings), "source": functools.partial(_source, project),
+        "head_without_names": _head_without_names, "source": functools.partial(_source, project)
     }  # fmt: skip
+    # As in: kind is ListType.
+    kinds = t.Type.__subclasses__()
+    templates.tests |= {each.__name__: lambda value, kind=each: isinstance(value, kind) for each in kinds}
     return templates
 
 
@@ -105,6 +109,10 @@ def _values(project: Project, is_served: bool) -> dict[str, Any]:
     recording, settings = project.recording, project.recording.bundle.settings
     cg, tokens = recording.bundle.cg, recording.tokens
     inputs, outputs = ([tokens[token] for token in names] for names in (settings.inputs, settings.outputs))
+    odd = [token for token in (*inputs, *outputs) if is_served and not _is_carried(token.type)]
+    if odd:
+        text = f"An event can't bring {odd[0].token!r} to a service in C++, nor an answer carry it"
+        raise BundleError(settings.name, f"{text}: {t.describe(odd[0].type)}.")
     called = [each for each, _ in project.called.values()]
     begins = {**settings.hyperparameters, **{token: delay.initial for token, delay in cg.delays.items()}}
     members = [
@@ -131,10 +139,35 @@ def _values(project: Project, is_served: bool) -> dict[str, Any]:
         "states": [tokens[token] for token in cg.delays],
         "has_arrays": "numpy::" in "".join(members),
         "has_served_arrays": "numpy::" in "".join(each.cpp for each in (*inputs, *outputs)),
-        "image": _image(project, inputs[0]) if len(inputs) == 1 else None,
-        "entries": entries(recording),
+        "entries": _entries(project),
+        "depths": t.DEPTHS,
+        "elements": t.ELEMENTS,
+        "readers": _READERS,
+        "records": _RECORDS,
         "about": functools.partial(_about, project),
         "bounds_of": functools.partial(_bounds, project),
+    }
+
+
+def _is_carried(kind: t.Type) -> bool:
+    """Whether messages have a form for a value."""
+    if isinstance(kind, t.ListType) and isinstance(kind.item, t.RecordType):
+        return kind.item.name in _RECORDS
+    if isinstance(kind, t.ListType | t.OptionalType):
+        return _is_carried(kind.item)
+    return all(map(_is_carried, kind.items)) if isinstance(kind, t.TupleType) else not isinstance(kind, t.RecordType)
+
+
+def _entries(project: Project) -> dict[str, dict[str, object]]:
+    """Return by name in C++ the hyperparameters as pipeline.toml has them, without numbers that JSON lacks."""
+
+    def is_json(part: object) -> bool:
+        numbers = part if isinstance(part, list) else [part]
+        return all(math.isfinite(number) for number in numbers if isinstance(number, float))
+
+    return {
+        project.recording.tokens[token].name: {key: part for key, part in entry.items() if is_json(part)}
+        for token, entry in project.recording.bundle.settings.entries.items()
     }
 
 
@@ -182,26 +215,6 @@ def _initial(value: Any, token: t.TokenType) -> str:
     shape = ", ".join(map(str, value.shape))
     array = f"numpy::array<{t.ELEMENTS[kind.dtype]}, {value.ndim}>({{{shape}}}, {{{numbers}}})"
     return f" = numpy::mat({array})" if kind.is_mat else f" = {array}"
-
-
-def _image(project: Project, token: t.TokenType) -> dict[str, Any] | None:
-    """Return how the program reads its only input from an image file: as cv2.imread reads what was recorded."""
-    kind, settings = token.type, project.recording.bundle.settings
-    if not isinstance(kind, t.ArrayType) or not kind.is_mat:
-        return None
-    depth = "" if kind.dtype == "uint8" else "cv::IMREAD_ANYDEPTH"
-    colour = {2: "cv::IMREAD_GRAYSCALE", 3: "cv::IMREAD_COLOR"}.get(kind.ndim, "cv::IMREAD_ANYCOLOR")
-    is_whole = kind.channels not in (0, 1, 3)
-    tests = [f"image.depth() != {t.DEPTHS[kind.dtype]}"] * bool(kind.dtype)
-    tests += [f"image.channels() != {kind.channels or 1}"] * (kind.ndim == 2 or kind.channels > 0)
-    is_rgb = token.token in settings.rgb and kind.ndim != 2
-    code = "RGBA" if kind.channels == 4 else "RGB"
-    return {
-        "token": token,
-        "flags": "cv::IMREAD_UNCHANGED" if is_whole else " | ".join(filter(None, (colour, depth))),
-        "is_other": " || ".join(tests) or "false",
-        "to_rgb": f"cv::COLOR_{code.replace('RGB', 'BGR')}2{code}" if is_rgb else "",
-    }
 
 
 def _write_samples(project: Project, folder: Path) -> None:

@@ -136,6 +136,18 @@ def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
     assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
 
 
+def test_a_token_that_messages_have_no_form_for_has_no_service(tmp_path):
+    def corner(image):
+        return cv2.KeyPoint(float(image[0, 0]), 2.0, 3.0)
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"corner": corner}, {"corner": ("image", "point")}))
+    runner.run(image=photograph(3)[:, :, 0])
+    with pytest.raises(
+        BundleError, match="can't bring 'point' to a service in C.., nor an answer carry it: cv::KeyPoint"
+    ):
+        ep.export_cpp(runner, tmp_path / "cpp", service=True)
+
+
 def test_without_jinja_the_extra_that_brings_it_is_named(bundle, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "jinja2", None)
     with pytest.raises(MissingPackage, match=r"Package 'jinja2' is missing. Run: pip install '.*\[cpp\]'"):

@@ -59,17 +59,24 @@ bool change(@{ns}::Hyperparameters& hyperparameters, const std::string& name, co
 }
 
 void read_inputs(const std::string& path, @{ns}::Inputs& inputs) {
-{% if image %}
-    cv::Mat image = cv::imread(path, @{image.flags});
+{% set kind = inputs[0].type if inputs | length == 1 %}
+{% if kind is ArrayType and kind.is_mat %}
+    {# As cv2.imread reads what was recorded. #}
+    {% set colour = {2: "cv::IMREAD_GRAYSCALE", 3: "cv::IMREAD_COLOR"}.get(kind.ndim, "cv::IMREAD_ANYCOLOR") %}
+    {% set flags = colour if kind.dtype == "uint8" else colour ~ " | cv::IMREAD_ANYDEPTH" %}
+    cv::Mat image = cv::imread(path, @{flags if kind.channels in (0, 1, 3) else "cv::IMREAD_UNCHANGED"});
     if (!image.empty()) {
-        if (@{image.is_other}) {
-            throw std::invalid_argument("@{image.token.name} has to be an array of @{about(image.token)}; " + path + " is read as " +
+    {% set depth = "image.depth() != " ~ depths[kind.dtype] if kind.dtype %}
+    {% set channels = "image.channels() != " ~ (kind.channels or 1) if kind.ndim == 2 or kind.channels %}
+        if (@{[depth, channels] | select | join(" || ") or "false"}) {
+            throw std::invalid_argument("@{inputs[0].name} has to be an array of @{about(inputs[0])}; " + path + " is read as " +
                                         cv::typeToString(image.type()));
         }
-{% if image.to_rgb %}
-        cv::cvtColor(image, image, @{image.to_rgb});  // the graph takes RGB
-{% endif %}
-        inputs.@{image.token.name} = image;
+    {% if inputs[0].token in settings.rgb and kind.ndim != 2 %}
+    {% set code = "COLOR_BGRA2RGBA" if kind.channels == 4 else "COLOR_BGR2RGB" %}
+        cv::cvtColor(image, image, cv::@{code});  // the graph takes RGB
+    {% endif %}
+        inputs.@{inputs[0].name} = image;
         return;
     }
 {% endif %}
