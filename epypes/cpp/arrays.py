@@ -6,19 +6,13 @@ NumPy itself says which dtype a calculation has (``ufunc.resolve_dtypes``); what
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 from epypes.cpp import types as t
 from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, is_number, refuse, writes
 
-_UFUNCS: Final[Mapping[type[ast.AST], str]] = {
-    ast.Add: "add", ast.Sub: "subtract", ast.Mult: "multiply", ast.Div: "true_divide", ast.FloorDiv: "floor_divide",
-    ast.Mod: "remainder", ast.BitAnd: "bitwise_and", ast.BitOr: "bitwise_or", ast.BitXor: "bitwise_xor",
-    ast.Eq: "equal", ast.NotEq: "not_equal", ast.Lt: "less", ast.LtE: "less_equal", ast.Gt: "greater",
-    ast.GtE: "greater_equal", ast.USub: "negative", ast.UAdd: "positive", ast.Invert: "invert"
-}  # fmt: skip
 SIZE: Final = t.Int(0, 2**31 - 1)
 
 
@@ -121,10 +115,11 @@ def joint_type(dtype: str, operands: Sequence[Expr]) -> t.Type:
     return made(dtype, ndim, channels.pop() if len(channels) == 1 else 0, operands)
 
 
-def calculate(scope: Scope, name: str, operands: Sequence[Expr], node: Any, *, is_compared: bool = False) -> Expr:
+def calculate(scope: Scope, name: str, operands: Sequence[Expr], node: Any) -> Expr:
     """Return what a function of NumPy makes of its operands, element by element."""
     scope.helpers.add("array")
     inner, outer = resolved(name, operands, node)
+    is_compared = name in t.data("numpy")["ufuncs"]["compared"]
     given = [operand(scope, each, inner, node, is_compared=is_compared) for each in operands]
     element = t.ELEMENTS[inner if is_compared else outer]
     function = "negated" if name == "negative" and "float" in outer else f"{name}<{element}>"
@@ -133,22 +128,12 @@ def calculate(scope: Scope, name: str, operands: Sequence[Expr], node: Any, *, i
 
 def binary(scope: Scope, operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
     """Return the result of an operator."""
-    name = _UFUNCS.get(type(operator))
+    name = t.operator(operator).get("numpy")
     if isinstance(operator, ast.Pow) and isinstance(left.type, t.ArrayType) and right.value == 2:
         return calculate(scope, "square", [left], node)
     if name is None:
         raise ByHand(f"{type(operator).__name__} of arrays", node)
     return calculate(scope, name, [left, right], node)
-
-
-def unary(scope: Scope, operator: ast.unaryop, given: Expr, node: Any) -> Expr:
-    """Return the result of an operator with one operand."""
-    return calculate(scope, _UFUNCS[type(operator)], [given], node)
-
-
-def compare(scope: Scope, operator: ast.cmpop, left: Expr, right: Expr, node: Any) -> Expr:
-    """Return the result of a comparison, element by element."""
-    return calculate(scope, _UFUNCS[type(operator)], [left, right], node, is_compared=True)
 
 
 # -- subscripts --------------------------------------------------------------------------------------------------------

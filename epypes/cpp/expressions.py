@@ -19,17 +19,6 @@ from epypes.cpp import arrays, opencv
 from epypes.cpp import types as t
 from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, is_number, no_counterpart, refuse, tuple_of
 
-_COMPARISONS: Final[Mapping[type[ast.cmpop], str]] = {
-    ast.Eq: "==", ast.NotEq: "!=", ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">="
-}  # fmt: skip
-_SIGNS: Final[Mapping[type[ast.operator], str]] = {
-    ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^",
-}  # fmt: skip
-# The functions of python.hpp.
-_NAMES: Final[Mapping[type[ast.operator], str]] = {
-    ast.Add: "add", ast.Sub: "subtract", ast.Mult: "multiply", ast.Div: "divide", ast.FloorDiv: "floor_divide",
-    ast.Mod: "modulo", ast.Pow: "power", ast.LShift: "shift_left", ast.RShift: "shift_right",
-}  # fmt: skip
 # An array that is written out.
 _MOST_ELEMENTS: Final = 64
 
@@ -102,7 +91,7 @@ def _attribute(scope: Scope, node: Any) -> Expr:
     if isinstance(owner.value, type) and owner.value.__module__.startswith("cv2"):
         return Expr("", t.NONE, getattr(owner.value, node.attr, UNKNOWN))
     if isinstance(owner.type, t.RecordType) and not owner.type.is_pointer:
-        kind = opencv.data("structures")["objects"].get(owner.type.name, {}).get(node.attr, "")
+        kind = t.data("structures")["objects"].get(owner.type.name, {}).get(node.attr, "")
         refuse(not kind, f"the attribute {node.attr!r} of a {owner.type.name}", node)
         return opencv.member(f"{owner.atom}.{node.attr}", kind)
     if isinstance(owner.type, t.ArrayType):
@@ -192,17 +181,18 @@ def binary(scope: Scope, operator: ast.operator, left: Expr, right: Expr, node: 
     """Return the result of an operator."""
     if left.value is not UNKNOWN and right.value is not UNKNOWN and left.parts is None and right.parts is None:
         return _folded(operator, left, right, node)
-    if isinstance(left.type, t.ArrayType) or isinstance(right.type, t.ArrayType) or _is_numpy(left) or _is_numpy(right):
+    if is_of_numpy(left) or is_of_numpy(right):
         return arrays.binary(scope, operator, left, right, node)
     if not all(isinstance(side.type, t.Int) or side.type in (t.FLOAT, t.BOOL) for side in (left, right)):
         raise ByHand(f"{t.describe(left.type)} {type(operator).__name__} {t.describe(right.type)}", node)
     if left.type == right.type == t.BOOL and isinstance(operator, ast.BitAnd | ast.BitOr | ast.BitXor):
-        return Expr(f"static_cast<bool>({left.atom} {_SIGNS[type(operator)]} {right.atom})", t.BOOL)
+        return Expr(f"static_cast<bool>({left.atom} {t.operator(operator)['sign']} {right.atom})", t.BOOL)
     return _of_numbers(scope, operator, left, right, node)
 
 
-def _is_numpy(given: Expr) -> bool:
-    return is_number(given.type) and bool(given.type.dtype)
+def is_of_numpy(given: Expr) -> bool:
+    """Whether NumPy calculates with a value: an array, or a number of a dtype."""
+    return isinstance(given.type, t.ArrayType) or bool(given.type.dtype)
 
 
 def _folded(operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
@@ -222,8 +212,8 @@ def _folded(operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
 
 def _of_numbers(scope: Scope, operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
     """Return the result of an operator on Python's numbers: by C++'s own where that gives the same for all values."""
-    left, right, name = widened(left), widened(right), _NAMES.get(type(operator))
-    sign, is_float = _SIGNS.get(type(operator)), t.FLOAT in (left.type, right.type)
+    left, right, table = widened(left), widened(right), t.operator(operator)
+    name, sign, is_float = table.get("python"), table.get("sign"), t.FLOAT in (left.type, right.type)
     kind: t.Type = t.FLOAT
     if is_float:
         refuse(name is None or name.startswith("shift"), f"{type(operator).__name__} of floats", node)
@@ -263,8 +253,8 @@ def _unary(scope: Scope, node: Any) -> Expr:
         value = UNKNOWN if found.value is UNKNOWN else not found.value
         return Expr(f"!{found.atom}", t.BOOL, value)
     given = value_of(scope, node.operand)
-    if isinstance(given.type, t.ArrayType) or _is_numpy(given):
-        return arrays.unary(scope, node.op, given, node)
+    if is_of_numpy(given):
+        return arrays.calculate(scope, t.operator(node.op)["numpy"], [given], node)
     if given.value is not UNKNOWN and isinstance(node.op, ast.USub) and is_number(given.type):
         return written(-given.value, "", node)
     refuse(given.type != t.FLOAT and not isinstance(widened(given).type, t.Int), f"{ast.unparse(node):.60}", node)
@@ -301,9 +291,9 @@ def _compared(scope: Scope, operator: ast.cmpop, left: Expr, right: Expr, node: 
         return _is_none(scope, left, right, node, is_not=isinstance(operator, ast.IsNot))
     if isinstance(operator, ast.In | ast.NotIn):
         return _contained(scope, left, right, node, is_not=isinstance(operator, ast.NotIn))
-    sign = _COMPARISONS[type(operator)]
-    if isinstance(left.type, t.ArrayType) or isinstance(right.type, t.ArrayType) or _is_numpy(left) or _is_numpy(right):
-        return arrays.compare(scope, operator, left, right, node)
+    sign = t.operator(operator)["sign"]
+    if is_of_numpy(left) or is_of_numpy(right):
+        return arrays.calculate(scope, t.operator(operator)["numpy"], [left, right], node)
     if left.parts is not None or right.parts is not None or isinstance(left.type, t.TupleType):
         one, other = opencv.items(left), opencv.items(right)
         if isinstance(operator, ast.Eq) and len(one) == len(other) > 0:
@@ -543,7 +533,7 @@ def _method(scope: Scope, node: Any, owner: Expr, hint: tuple[str, ...]) -> Expr
     name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
     if isinstance(owner.type, t.RecordType) and owner.type.is_pointer:
         return opencv.call(scope, node, name, arguments(scope, node), hint, this=owner, owner=owner.type.name)
-    if isinstance(owner.type, t.ArrayType) or _is_numpy(owner):
+    if is_of_numpy(owner):
         from epypes.cpp import numpy as functions
 
         return functions.method(scope, owner, name, node)

@@ -10,12 +10,9 @@ from typing import Any, Final
 from epypes.cpp import arrays
 from epypes.cpp import types as t
 from epypes.cpp.expressions import arguments, condition, list_of, value_of, widened, written
-from epypes.cpp.scope import UNKNOWN, Binding, ByHand, Expr, Scope, is_number, refuse, tuple_of
+from epypes.cpp.scope import UNKNOWN, Binding, ByHand, Expr, Scope, is_number, names_in, refuse, tuple_of
 
 _ROUNDS: Final = 5
-# Functions of math: those that have a value for each number, and those that raise for some.
-_TOTAL: Final = ("sin", "cos", "tan", "atan", "atan2", "fabs", "tanh", "copysign")
-_PARTIAL: Final = ("sqrt", "asin", "acos", "exp", "log", "log10", "log2", "sinh", "cosh")
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,22 +155,14 @@ def bind(scope: Scope, target: ast.expr, value: Expr, node: Any, *, is_local: bo
 def is_loops_own(scope: Scope, names: Sequence[str]) -> bool:
     """Whether names are assigned by loops alone, and read inside of these."""
     inside: set[int] = set()
-    targets: set[int] = set()
     for loop in ast.walk(scope.node):
         if isinstance(loop, ast.For):
-            own = {each.id for each in ast.walk(loop.target) if isinstance(each, ast.Name)}
-            targets |= {id(each) for each in ast.walk(loop.target)}
-            inside |= {
-                id(each)
-                for part in loop.body
-                for each in ast.walk(part)
-                if isinstance(each, ast.Name) and each.id in own
-            }
-    each: Any
-    for each in ast.walk(scope.node):
-        is_other = isinstance(each, ast.Name) and each.id in names and id(each) not in targets
-        if is_other and (isinstance(each.ctx, ast.Store) or id(each) not in inside):
-            return False
+            inside |= {id(each) for each in names_in(loop.target)}
+            own = {each.id for each in names_in(loop.target)}
+            read = (each for part in loop.body for each in names_in(part, ast.Load))
+            inside |= {id(each) for each in read if each.id in own}
+    if any(each.id in names and id(each) not in inside for each in names_in(scope.node)):
+        return False
     return not any(arg.arg in names for arg in scope.node.args.args)
 
 
@@ -215,9 +204,9 @@ def for_statement(scope: Scope, node: ast.For, returned: t.Type | None) -> None:
     from epypes.cpp.statements import body
 
     refuse(node.orelse, "a loop with else", node)
-    names = [each.id for each in ast.walk(node.target) if isinstance(each, ast.Name)]
+    names = [each.id for each in names_in(node.target)]
     is_made = isinstance(node.iter, ast.Call) and getattr(node.iter.func, "id", "") not in ("enumerate", "zip")
-    over = {each.id for each in ast.walk(node.iter) if isinstance(each, ast.Name)} if not is_made else set()
+    over = {each.id for each in names_in(node.iter)} if not is_made else set()
     grown = {
         ast.unparse(each.value) for each in ast.walk(node) if isinstance(each, ast.Attribute) and each.attr == "append"
     }
@@ -286,7 +275,7 @@ def comprehension(scope: Scope, node: Any) -> Expr:
             scope.emit(f"{name}.push_back({fitted(scope, found, elements[0], node)});")
             return
         each = node.generators[index]
-        names = [part.id for part in ast.walk(each.target) if isinstance(part, ast.Name)]
+        names = [part.id for part in names_in(each.target)]
         iteration = iterate(scope, each.iter, names)
         with scope.inside(iteration.head):
             bind(scope, each.target, iteration.item(), node, is_local=True)
@@ -345,11 +334,12 @@ def of_math(scope: Scope, name: str, node: Any) -> Expr:
         return Expr(
             f"{first.atom} * ({'CV_PI / 180.0' if name == 'radians' else '180.0 / CV_PI'})", t.FLOAT, is_atom=False
         )
-    refuse(name not in _TOTAL and name not in _PARTIAL, f"math.{name} has no translation", node)
+    total, partial = t.data("python")["math"].values()
+    refuse(name not in (*total, *partial), f"math.{name} has no translation", node)
     numbers = ", ".join(each.text if each.type == t.FLOAT else f"static_cast<double>({each.text})" for each in given)
     # Where Python raises, C++ would go on with NaN or infinity.
     return Expr(
-        f"std::{name}({numbers})" if name in _TOTAL else f"python::finite(std::{name}({numbers}), {numbers})", t.FLOAT
+        f"std::{name}({numbers})" if name in total else f"python::finite(std::{name}({numbers}), {numbers})", t.FLOAT
     )
 
 

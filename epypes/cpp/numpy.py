@@ -10,17 +10,8 @@ from typing import Any, Final
 from epypes.cpp import arrays
 from epypes.cpp import types as t
 from epypes.cpp.expressions import arguments, value_of
-from epypes.cpp.scope import ByHand, Expr, Scope, is_number, refuse, shares, tuple_of
+from epypes.cpp.scope import Expr, Scope, is_number, refuse, shares, tuple_of
 
-# Functions of each element that give the same bits in C++; others, as sin, have other last digits in NumPy's loops.
-_ELEMENTWISE: Final = frozenset(
-    "add subtract multiply true_divide floor_divide remainder minimum maximum hypot bitwise_and bitwise_or bitwise_xor"  # noqa: SIM905
-    " logical_and logical_or negative square sqrt floor ceil trunc rint absolute invert".split()
-)
-_TESTS: Final = ("isnan", "isfinite", "logical_not")
-_COMPARED: Final = ("less", "less_equal", "greater", "greater_equal", "equal", "not_equal")
-_REDUCTIONS: Final = ("sum", "mean", "min", "max", "argmax", "argmin", "any", "all", "std", "var", "count_nonzero")
-_METHODS: Final = ("copy", "reshape", "ravel", "transpose", "clip", "nonzero")
 Bound = dict[str, Expr]
 
 
@@ -36,32 +27,26 @@ def call(scope: Scope, function: Any, name: str, node: Any) -> Expr:
         name = function.__name__
         name = {"divide": "true_divide", "conjugate": ""}.get(name, name)
         refuse(named or len(given) != function.nin, f"np.{name} with these arguments: {_listed(node)}", node)
-        if name in _TESTS:
+        elementwise, tests, compared = t.data("numpy")["ufuncs"].values()
+        if name in tests:
             return _test(scope, name, given[0], node)
-        is_same = name in _ELEMENTWISE or name in _COMPARED
-        refuse(not is_same, f"np.{name}, whose last digits are others in C++", node)
-        return arrays.calculate(scope, name, given, node, is_compared=name in _COMPARED)
+        refuse(name not in elementwise + compared, f"np.{name}, whose last digits are others in C++", node)
+        return arrays.calculate(scope, name, given, node)
     return _function(scope, name, given, named, node)
 
 
 def _function(scope: Scope, name: str, given: Sequence[Expr], named: Mapping[str, Expr], node: Any) -> Expr:
-    name = {"amin": "min", "amax": "max", "around": "round"}.get(name, name)
-    names, build = _FUNCTIONS.get(name, ((), _none))
-    if name in _REDUCTIONS:
-        names, build = ("a", "axis"), lambda scope, bound, node: _reduced(scope, name, bound, node)
-    refuse(not names, f"np.{name} has no translation", node)
+    entry = t.data("numpy")["functions"].get(name, {})
+    refuse(not entry, f"np.{name} has no translation", node)
+    names, options = entry["takes"], {key: entry[key] for key in entry.keys() - {"takes", "build", "is_method"}}
     is_other = not given or len(given) > len(names) or named.keys() - {*names}
     refuse(is_other, f"np.{name} with these arguments: {_listed(node)}", node)
-    return build(scope, dict(zip(names, given, strict=False)) | dict(named), node)
+    return _BUILDERS[entry["build"]](scope, dict(zip(names, given, strict=False)) | dict(named), node, **options)
 
 
 def _listed(node: Any) -> str:
     """Return the arguments of a call as they are written."""
     return ", ".join(ast.unparse(each) for each in (*node.args, *node.keywords))
-
-
-def _none(scope: Scope, bound: Bound, node: Any) -> Expr:
-    raise ByHand("no function", node)
 
 
 def method(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
@@ -78,7 +63,9 @@ def method(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
     if name == "flatten" and is_array and not given:
         owner, name = _ravel(scope, {"a": owner}, node), "copy"
     refuse(
-        not is_array or name not in (*_METHODS, *_REDUCTIONS), f"the method {name!r} of {t.describe(owner.type)}", node
+        not is_array or not t.data("numpy")["functions"].get(name, {}).get("is_method"),
+        f"the method {name!r} of {t.describe(owner.type)}",
+        node,
     )
     if name == "reshape" and len(given) != 1:
         given = [tuple_of(given)]
@@ -155,7 +142,7 @@ def _axis(given: Expr | None, ndim: int, node: Any) -> int | None:
     return int(given.value % ndim)
 
 
-def _reduced(scope: Scope, name: str, bound: Bound, node: Any) -> Expr:
+def _reduced(scope: Scope, bound: Bound, node: Any, name: str) -> Expr:
     import numpy as np
 
     array = arrays.as_array(scope, bound["a"], node)
@@ -200,25 +187,22 @@ def _channels(parts: Sequence[Expr]) -> int:
     return max(0, parts[2].value) if len(parts) == 3 and type(parts[2].value) is int else 0
 
 
-def _full(value: str) -> Builder:
-    def build(scope: Scope, bound: Bound, node: Any) -> Expr:
-        fill, like = bound.get("fill_value"), []
-        if "a" in bound:
-            array = arrays.as_array(scope, bound["a"], node)
-            ndim, channels, shape = array.type.ndim, array.type.channels, f"{array.text}.shape"
-            dtype, like = _dtype(bound.get("dtype"), node, array.type.dtype), [array]
-        else:
-            parts = _shape(bound["shape"], node)
-            ndim, channels, shape = len(parts), _channels(parts), f"{{{', '.join(part.text for part in parts)}}}"
-            dtype = _dtype(bound.get("dtype"), node, "float64" if fill is None else arrays.own_dtype(fill.type))
-        if fill is not None:
-            is_float = fill.type == t.FLOAT and "float" not in dtype
-            refuse(not is_number(fill.type) or is_float, f"{t.describe(fill.type)} in an array of {dtype}", node)
-        text = f"static_cast<{t.ELEMENTS[dtype]}>({value})" if fill is None else _number(scope, fill, dtype, node)
-        kind = arrays.made(dtype, ndim, channels, like)
-        return Expr(f"numpy::full<{t.ELEMENTS[dtype]}, {ndim}>({shape}, {text})", kind)
-
-    return build
+def _full(scope: Scope, bound: Bound, node: Any, value: str = "") -> Expr:
+    fill, like = bound.get("fill_value"), []
+    if "a" in bound:
+        array = arrays.as_array(scope, bound["a"], node)
+        ndim, channels, shape = array.type.ndim, array.type.channels, f"{array.text}.shape"
+        dtype, like = _dtype(bound.get("dtype"), node, array.type.dtype), [array]
+    else:
+        parts = _shape(bound["shape"], node)
+        ndim, channels, shape = len(parts), _channels(parts), f"{{{', '.join(part.text for part in parts)}}}"
+        dtype = _dtype(bound.get("dtype"), node, "float64" if fill is None else arrays.own_dtype(fill.type))
+    if fill is not None:
+        is_float = fill.type == t.FLOAT and "float" not in dtype
+        refuse(not is_number(fill.type) or is_float, f"{t.describe(fill.type)} in an array of {dtype}", node)
+    text = f"static_cast<{t.ELEMENTS[dtype]}>({value})" if fill is None else _number(scope, fill, dtype, node)
+    kind = arrays.made(dtype, ndim, channels, like)
+    return Expr(f"numpy::full<{t.ELEMENTS[dtype]}, {ndim}>({shape}, {text})", kind)
 
 
 def _array(scope: Scope, bound: Bound, node: Any) -> Expr:
@@ -317,27 +301,21 @@ def _arange(scope: Scope, bound: Bound, node: Any) -> Expr:
     return Expr(f"numpy::arange<{t.ELEMENTS[dtype]}>({low}, {high}, {step})", arrays.made(dtype, 1))
 
 
-def _joined(axis: int | None = None, *, is_stack: bool = False) -> Builder:
-    """Return what joins arrays: along an axis, or in a new one."""
-
-    def build(scope: Scope, bound: Bound, node: Any) -> Expr:
-        parts = [arrays.as_array(scope, part, node) for part in bound["arrays"].parts or ()]
-        kinds = {(part.type.dtype, part.type.ndim) for part in parts}
-        refuse(
-            len(kinds) != 1, "arrays that are not written out, or of different dtypes or dimensions, are joined", node
-        )
-        dtype, ndim = kinds.pop()
-        # np.vstack makes rows of what has one dimension, and np.hstack goes on in the first.
-        is_new = is_stack or (axis == 0 and ndim == 1)
-        chosen = min(axis, ndim - 1) if axis is not None else 0
-        if "axis" in bound:
-            chosen = _axis(bound["axis"], ndim + is_new, node) or 0
-        element = f"numpy::Array<{t.ELEMENTS[dtype]}, {ndim + is_new}>"
-        texts = ", ".join(f"numpy::raised({part.text}, {chosen})" if is_new else part.text for part in parts)
-        kind = arrays.made(dtype, ndim + is_new, len(parts) if is_new and chosen == 2 else 0, parts)
-        return Expr(f"numpy::concatenate(std::vector<{element}>{{{texts}}}, {chosen})", kind)
-
-    return build
+def _joined(scope: Scope, bound: Bound, node: Any, axis: int | None = None, is_stack: bool = False) -> Expr:
+    """Join arrays along an axis, or in a new one."""
+    parts = [arrays.as_array(scope, part, node) for part in bound["arrays"].parts or ()]
+    kinds = {(part.type.dtype, part.type.ndim) for part in parts}
+    refuse(len(kinds) != 1, "arrays that are not written out, or of different dtypes or dimensions, are joined", node)
+    dtype, ndim = kinds.pop()
+    # np.vstack makes rows of what has one dimension, and np.hstack goes on in the first.
+    is_new = is_stack or (axis == 0 and ndim == 1)
+    chosen = min(axis, ndim - 1) if axis is not None else 0
+    if "axis" in bound:
+        chosen = _axis(bound["axis"], ndim + is_new, node) or 0
+    element = f"numpy::Array<{t.ELEMENTS[dtype]}, {ndim + is_new}>"
+    texts = ", ".join(f"numpy::raised({part.text}, {chosen})" if is_new else part.text for part in parts)
+    kind = arrays.made(dtype, ndim + is_new, len(parts) if is_new and chosen == 2 else 0, parts)
+    return Expr(f"numpy::concatenate(std::vector<{element}>{{{texts}}}, {chosen})", kind)
 
 
 def _sort(scope: Scope, bound: Bound, node: Any) -> Expr:
@@ -358,8 +336,8 @@ def _average(scope: Scope, bound: Bound, node: Any) -> Expr:
     array, weights = (arrays.as_array(scope, bound[name], node) for name in ("a", "weights"))
     kinds = {(each.type.dtype, each.type.ndim) for each in (array, weights)}
     refuse(kinds != {("float64", array.type.ndim)}, "np.average of other arrays than float64", node)
-    total = _reduced(scope, "sum", {"a": arrays.calculate(scope, "multiply", [array, weights], node)}, node)
-    return Expr(f"numpy::weighted({total.text}, {_reduced(scope, 'sum', {'a': weights}, node).text})", total.type)
+    total = _reduced(scope, {"a": arrays.calculate(scope, "multiply", [array, weights], node)}, node, "sum")
+    return Expr(f"numpy::weighted({total.text}, {_reduced(scope, {'a': weights}, node, 'sum').text})", total.type)
 
 
 def _copy(scope: Scope, bound: Bound, node: Any) -> Expr:
@@ -390,31 +368,8 @@ def _transposed(scope: Scope, bound: Bound, node: Any) -> Expr:
     return arrays.attribute(scope, bound["a"], "T", node)
 
 
-Builder = Callable[[Scope, Bound, Any], Expr]
-_FUNCTIONS: Final[Mapping[str, tuple[Sequence[str], Builder]]] = {
-    "zeros": (("shape", "dtype"), _full("0")),
-    "ones": (("shape", "dtype"), _full("1")),
-    "full": (("shape", "fill_value", "dtype"), _full("")),
-    "zeros_like": (("a", "dtype"), _full("0")),
-    "ones_like": (("a", "dtype"), _full("1")),
-    "full_like": (("a", "fill_value", "dtype"), _full("")),
-    "array": (("object", "dtype"), _array),
-    "asarray": (("object", "dtype"), _same),
-    "ascontiguousarray": (("object", "dtype"), _same),
-    "copy": (("a",), _copy),
-    "reshape": (("a", "shape"), _reshape),
-    "ravel": (("a",), _ravel),
-    "transpose": (("a",), _transposed),
-    "clip": (("a", "a_min", "a_max"), _clip),
-    "where": (("condition", "x", "y"), _where),
-    "nonzero": (("a",), _nonzero),
-    "arange": (("start", "stop", "step", "dtype"), _arange),
-    "concatenate": (("arrays", "axis"), _joined()),
-    "hstack": (("arrays",), _joined(1)),
-    "vstack": (("arrays",), _joined(0)),
-    "stack": (("arrays", "axis"), _joined(is_stack=True)),
-    "sort": (("a",), _sort),
-    "argsort": (("a", "kind"), _argsort),
-    "average": (("a", "weights"), _average),
-    "round": (("a",), _rounded),
-}
+_BUILDERS: Final[Mapping[str, Callable[..., Expr]]] = {
+    "full": _full, "array": _array, "same": _same, "copy": _copy, "reshape": _reshape, "ravel": _ravel,
+    "transposed": _transposed, "clip": _clip, "where": _where, "nonzero": _nonzero, "arange": _arange,
+    "joined": _joined, "sort": _sort, "argsort": _argsort, "average": _average, "rounded": _rounded, "reduced": _reduced
+}  # fmt: skip

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import json
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
@@ -29,15 +28,9 @@ def table() -> Mapping[str, Any]:
     return found
 
 
-@functools.cache
-def data(name: str) -> Mapping[str, Any]:
-    """Return a table of the data files: results, of the arrays that functions make, or structures."""
-    return tomllib.loads((files("epypes.cpp") / "data" / f"{name}.toml").read_text("utf-8"))
-
-
 def tuples() -> Mapping[str, Mapping[str, str]]:
     """Return the structures that are tuples in Python: the types of their members by name."""
-    found: Mapping[str, Mapping[str, str]] = data("structures")["tuples"]
+    found: Mapping[str, Mapping[str, str]] = t.data("structures")["tuples"]
     return found
 
 
@@ -267,7 +260,7 @@ class _Call:
     def _rule(self, index: int) -> Mapping[str, Any]:
         """Return what the table has on the array at a place among the results."""
         name = self.name if self.this is None else f"{self.this.type.name}.{self.name}"
-        rules: Any = data("results").get(name, {})
+        rules: Any = t.data("results").get(name, {})
         found: Mapping[str, Any] = rules if isinstance(rules, dict) else dict(enumerate(rules)).get(index, {})
         refuse("by_hand" in found, f"cv2.{name}: {found.get('by_hand')}", self.node)
         return found

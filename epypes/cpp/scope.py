@@ -155,9 +155,7 @@ class Scope:
         self.node, self.names, self.functions, self.refined = node, names, functions, refined
         self.block = self.body = Block()
         self.env: dict[str, Binding] = {}
-        self.stored = {
-            each.id for each in ast.walk(node) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)
-        }
+        self.stored = {each.id for each in names_in(node, ast.Store)}
         self.locals = self.stored | {arg.arg for arg in node.args.args}
         self.used: set[str] = set()
         self.variables: dict[tuple[str, str], Variable] = {}
@@ -274,10 +272,7 @@ class Scope:
         kind = value.type
         if not kind.cpp or (isinstance(kind, t.Plain) and kind.name == "None"):
             raise ByHand(f"{name!r} becomes {t.describe(kind)}, which has no type in C++", node)
-        is_read = any(
-            isinstance(each, ast.Name) and each.id == name and isinstance(each.ctx, ast.Load)
-            for each in ast.walk(self.node)
-        )
+        is_read = any(each.id == name for each in names_in(self.node, ast.Load))
         if not is_read and all(re.fullmatch(r"[\w.]+", each.text) for each in value.parts or [value]):
             return
         constant = value.value if type(value.value) in (int, float, bool, str) else UNKNOWN
@@ -380,6 +375,11 @@ def _places(body: Sequence[ast.stmt], path: tuple[Any, ...]) -> Iterator[tuple[t
                 for each in value if isinstance(value, list) else [value]:
                     if isinstance(each, ast.AST):
                         yield from ((inner, node) for node in ast.walk(each))
+
+
+def names_in(node: ast.AST, context: type[ast.expr_context] = ast.expr_context) -> Iterator[ast.Name]:
+    """Yield the names in a part of a function, all or those that are read or assigned."""
+    return (each for each in ast.walk(node) if isinstance(each, ast.Name) and isinstance(each.ctx, context))
 
 
 def is_number(kind: t.Type) -> bool:

@@ -24,26 +24,15 @@ from epypes.cpp.expressions import (
     written,
 )
 from epypes.cpp.loops import for_statement, leave, while_statement
-from epypes.cpp.scope import UNKNOWN, Binding, ByHand, Expr, Scope, refuse
+from epypes.cpp.scope import UNKNOWN, Binding, ByHand, Expr, Scope, names_in, refuse
 from epypes.optional import optional_import
 
 _ROUNDS: Final = 6
-_REFUSED: Final = {
-    "Await": "an `await`", "Global": "a `global` statement", "Nonlocal": "a `nonlocal` statement",
-    "Try": "a `try` statement", "TryStar": "a `try` statement", "ClassDef": "a class of its own",
-    "NamedExpr": "an assignment with `:=`", "With": "a `with` statement", "Delete": "a `del` statement",
-    "Match": "a `match` statement"
-}  # fmt: skip
 # The nodes that read a list without giving it a second name.
 _READERS: Final = (
     ast.Attribute, ast.Subscript, ast.For, ast.comprehension, ast.Compare, ast.BoolOp, ast.UnaryOp, ast.If, ast.While,
     ast.Return
 )  # fmt: skip
-# What Python raises, and what C++ throws for it.
-_ERRORS: Final[Mapping[str, str]] = {
-    "ValueError": "std::invalid_argument", "TypeError": "std::invalid_argument", "RuntimeError": "std::runtime_error",
-    "IndexError": "std::out_of_range", "OverflowError": "std::overflow_error", "AssertionError": "std::logic_error"
-}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +123,7 @@ def _without_imports(node: ast.FunctionDef, names: Mapping[str, Any]) -> tuple[a
 def _with_options(node: ast.FunctionDef) -> ast.FunctionDef:
     """Return a function in which a dict that only ``**`` reads stands as named arguments where it is read."""
     node = copy.deepcopy(node)
-    stored = [each.id for each in ast.walk(node) if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)]
+    stored = [each.id for each in names_in(node, ast.Store)]
     statement: Any
     for statement in [*node.body]:
         value, name = getattr(statement, "value", None), getattr(getattr(statement, "targets", [None])[0], "id", "")
@@ -142,8 +131,8 @@ def _with_options(node: ast.FunctionDef) -> ast.FunctionDef:
             continue
         calls = [each for each in ast.walk(node) if isinstance(each, ast.Call)]
         reads = [each for each in calls if any(_reads(part, name) for part in each.keywords)]
-        loads = sum(isinstance(each, ast.Name) and each.id == name for each in ast.walk(node)) - 1
-        changed = {each.id for each in ast.walk(value) if isinstance(each, ast.Name)} & {*stored}
+        loads = sum(each.id == name for each in names_in(node)) - 1
+        changed = {each.id for each in names_in(value)} & {*stored}
         if loads == len(reads) and not changed and all(isinstance(key, ast.Constant) for key in value.keys):
             keys = [str(getattr(key, "value", "")) for key in value.keys]
             given = [ast.keyword(key, each) for key, each in zip(keys, value.values, strict=True)]
@@ -171,7 +160,8 @@ def _check(node: ast.FunctionDef) -> None:
     for each in ast.walk(node):
         kind = type(each).__name__
         refuse(kind.startswith("Yield"), "it is a generator", each)
-        refuse(kind in _REFUSED, f"it has {_REFUSED.get(kind)}", each)
+        refused = t.data("python")["refused"].get(kind)
+        refuse(refused, f"it has {refused}", each)
         if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef) and each is not node:
             raise ByHand("it has a function of its own", each)
         if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store) and hasattr(builtins, each.id):
@@ -299,8 +289,8 @@ def _assign(scope: Scope, node: Any, returned: t.Type | None) -> None:
 def _assign_each(scope: Scope, target: Any, value: Any, node: Any) -> None:
     """Assign side by side: all values are computed before the first is assigned."""
     found = [value_of(scope, each) for each in value.elts]
-    names = {each.id for each in ast.walk(target) if isinstance(each, ast.Name)}
-    read = {each.id for each in ast.walk(value) if isinstance(each, ast.Name)}
+    names = {each.id for each in names_in(target)}
+    read = {each.id for each in names_in(value)}
     if names & read or any(isinstance(each, ast.Subscript) for each in target.elts):
         for index, each in enumerate(found):
             if each.value is UNKNOWN:
@@ -440,8 +430,9 @@ def _raise(scope: Scope, node: Any, returned: t.Type | None) -> None:
     refuse(len(call.args) > 1 or call.keywords or node.cause or name in scope.locals, "an error of several parts", node)
     given = call.args[0] if call.args else ast.Constant("")
     message = ast.unparse(given)[2:-1] if isinstance(given, ast.JoinedStr) else getattr(given, "value", None)
-    refuse(name not in _ERRORS or not isinstance(message, str), "an error that is no plain one of Python", node)
-    scope.emit(f"throw {_ERRORS[name]}({t.quoted(str(message))});")
+    thrown = t.data("python")["errors"].get(name)
+    refuse(not thrown or not isinstance(message, str), "an error that is no plain one of Python", node)
+    scope.emit(f"throw {thrown}({t.quoted(str(message))});")
     scope.is_dead = True
 
 

@@ -6,9 +6,11 @@ an `Array<T, N>` of array.hpp, the C++ form of NumPy's arrays.
 
 from __future__ import annotations
 
+import ast
 import functools
 import keyword
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
@@ -238,8 +240,15 @@ class TokenType:
 
 
 @functools.cache
-def _reserved() -> frozenset[str]:
-    return frozenset((files("epypes.cpp") / "data" / "reserved.txt").read_text("utf-8").split())
+def data(name: str) -> Mapping[str, Any]:
+    """Return one of the tables in ``data/``."""
+    return tomllib.loads((files("epypes.cpp") / "data" / f"{name}.toml").read_text("utf-8"))
+
+
+def operator(node: ast.AST) -> Mapping[str, str]:
+    """Return what an operator of Python is in C++."""
+    found: Mapping[str, str] = data("python")["operators"].get(type(node).__name__, {})
+    return found
 
 
 def identifier(name: str) -> str:
@@ -248,7 +257,7 @@ def identifier(name: str) -> str:
     plain = re.sub(r"^_*(?=\d)", "n", plain)
     # Names with two underscores, or one before a capital letter, belong to the compiler.
     plain = re.sub(r"__+", "_", plain).lstrip("_") or "value"
-    return f"{plain}_" if plain in _reserved() or keyword.iskeyword(plain) else plain
+    return f"{plain}_" if plain in data("names")["reserved"] or keyword.iskeyword(plain) else plain
 
 
 def identifiers(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:

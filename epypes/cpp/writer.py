@@ -8,7 +8,6 @@ import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -273,13 +272,7 @@ def _head_without_names(function: CppFunction) -> str:
 
 def namespace_of(project: Project) -> str:
     """Return the namespace, which is named after the bundle."""
-    return t.identifiers([project.recording.bundle.settings.name], _taken()).popitem()[1]
-
-
-@functools.cache
-def _taken() -> tuple[str, ...]:
-    """Return the names of the project's other namespaces and targets, and the global names of the C library."""
-    return tuple((files("epypes.cpp") / "data" / "global_names.txt").read_text("utf-8").split())
+    return t.identifiers([project.recording.bundle.settings.name], t.data("names")["global"]).popitem()[1]
 
 
 def _one_line(text: str) -> str:
