@@ -284,8 +284,8 @@ def store(scope: Scope, owner: Expr, target: ast.Subscript, value: Expr, node: A
         chosen = selector.type
         assert isinstance(chosen, t.ArrayType)  # noqa: S101 - for the type checker
         rank = value.type.ndim if isinstance(value.type, t.ArrayType) else int(value.parts is not None)
-        # A number, the elements in their order, or a row for each row.
-        is_sure = chosen.dtype == "bool" and (rank == 0 or (rank == 1 and kind.ndim - chosen.ndim < 2))
+        # One number or row for all that is selected, or one for each in order.
+        is_sure = chosen.dtype == "bool" and rank <= kind.ndim - chosen.ndim + 1
         refuse(not is_sure, f"an assignment to the elements that {t.describe(chosen)} selects", node)
         scope.emit(f"numpy::put({array.text}, {selector.text}, {text});")
         return

@@ -315,7 +315,9 @@ def _is_none(scope: Scope, left: Expr, right: Expr, node: Any, *, is_not: bool) 
     if left.value is None:
         return written(not is_not, "", node)
     refuse(isinstance(left.type, t.OptionalType), f"a value that is {t.describe(left.type)}", node)
-    if isinstance(left.type, t.ArrayType) and left.type.is_mat:
+    kind = left.type
+    # What OpenCV makes may be empty, of which Python has None, also where no table says so.
+    if isinstance(kind, t.ArrayType) and kind.is_mat and (kind.is_nullable or not kind.is_readonly):
         scope.helpers.add("python")
         return Expr(f"{'!' if is_not else ''}python::is_none({left.text})", t.BOOL)
     return written(is_not, "", node)

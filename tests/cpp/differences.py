@@ -880,6 +880,57 @@ def nested_input_in_place(groups):
     return groups[0][0]
 
 
+def none_of_opencv(image):
+    contours, hierarchy = cv2.findContours(image * 0, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
+    one = np.zeros((5, 1, 2), np.float32)
+    found, _ = cv2.findHomography(one, one)
+    part = cv2.intersectConvexConvex(one[:3], one[:3] + 5)[1]
+    return hierarchy is None, found is None, 1 if part is None else 2, image is None, cv2.blur(image, (3, 3)) is not None
+
+
+def masked_rows(colour, image):
+    own = colour.copy()
+    own[image > 9] = (1, 2, 3)
+    own[image == 7] = own[0, 0]
+    own[:, ::2][image[:, ::2] > 99] = [7]
+    own[image > 150] //= 2
+    own[image < 9] = own[image < 9][::-1]
+    return own
+
+
+def several_names(a):
+    b = c = a + 1
+    c += 1
+    first = second = np.zeros(3)
+    first[0] = b
+    return b, c, second
+
+
+def array_of_either_kind(image):
+    found, last = np.zeros(image.shape, np.uint8), image
+    for shift in range(3):
+        found = cv2.bitwise_or(found, cv2.blur(image, (3, 3)))
+        last = found[::-1] if shift == 1 else cv2.flip(last, 0)
+    found[0] = 5
+    return found, last
+
+
+def extremes_of_two_types(a, x):
+    return int(max(0, x)), int(min(255, x * a)), float(max(2, x)), cv2.threshold(np.uint8([[3, 9]]), max(5, x), 8, 0)[1]
+
+
+def added_in_a_loop_over_itself(values):
+    kept = []
+    for value in values:
+        for other in kept:
+            if other == value:
+                break
+        else_ = len(kept)
+        if else_ < 2:
+            kept.append(value)
+    return kept
+
+
 def array_in_two_names(image):
     own = np.zeros_like(image)
     other = own
@@ -1108,6 +1159,12 @@ INPUTS: dict[str, list[tuple[Any, ...]]] = {
     "written_after_transposed": _IMAGES,
     "written_after_nonzero": _IMAGES,
     "nested_input_in_place": [([[_GRID[0], _GRID[1]]],)],
+    "none_of_opencv": _IMAGES,
+    "masked_rows": [(_COLOUR, _GRID), (_COLOUR[:3], _GRID[:3])],
+    "several_names": _INTS,
+    "array_of_either_kind": _IMAGES,
+    "extremes_of_two_types": [(7, 2.5), (-3, -0.5), (4, 300.25)],
+    "added_in_a_loop_over_itself": _LISTS,
     "array_in_two_names": _IMAGES,
     "appended_rows": _IMAGES,
     "filled_in_helper": _IMAGES,

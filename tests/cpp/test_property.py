@@ -29,15 +29,15 @@ TOO_LARGE = "an integer has more than 64 bits"
 RAISES = ("growing",)
 # What many graphs have. Others have several items, of which one has no translation.
 TRANSLATED = [
-    "argument_of_either_sign", "array_division", "astype_wraps", "augmented_float", "backwards", "bits",
+    "added_in_a_loop_over_itself", "argument_of_either_sign", "array_division", "array_of_either_kind", "astype_wraps", "augmented_float", "backwards", "bits",
     "boxes_of_contours", "calculated_of_transposed", "centre_of_mass", "chained", "changed_bound", "changed_loop_variable", "channels", "circles",
     "cleaned", "clipped_to_nan", "compared_out_of_range", "compared_sums", "compared_types", "components", "contours",
-    "corner_points", "cut_out", "drawn_boxes", "drifting", "drifting_branch", "drifting_while", "early_return", "empty", "enclosing_circle",
+    "corner_points", "cut_out", "drawn_boxes", "drifting", "drifting_branch", "drifting_while", "early_return", "empty", "enclosing_circle", "extremes_of_two_types",
     "float_floor_division", "focus_map", "forever", "from_above", "growing", "half_size", "hough_lines", "integers_of_pixels",
-    "iou", "keywords", "large", "last_of_loop", "masked_assignment", "matched_template", "minus_of_sum",
-    "moving_threshold", "negative_index", "numbers_of_int64", "outputs_of_opencv", "overflow_uint8", "overlapping",
+    "iou", "keywords", "large", "last_of_loop", "masked_assignment", "masked_rows", "matched_template", "minus_of_sum",
+    "moving_threshold", "negative_index", "none_of_opencv", "numbers_of_int64", "outputs_of_opencv", "overflow_uint8", "overlapping",
     "polygon_corners", "promoted", "reshaped", "reshaped_columns", "returned_views", "rotated", "rounded", "row_of_copy", "saturated",
-    "scalars_of_numpy", "shape_and_size", "share_of_colour", "sharpness", "shifts", "slices", "straight_parts",
+    "scalars_of_numpy", "several_names", "shape_and_size", "share_of_colour", "sharpness", "shifts", "slices", "straight_parts",
     "sum_of_bools",
     "sum_of_mask", "sum_of_uint8", "sums_of_columns", "swapped", "ternary_of_two_types", "true_division",
     "truncated_points", "truth", "two_lists", "unsharp", "view_in_place", "views", "views_in_lists", "views_of_helper", "where_mixed", "white_pixels",

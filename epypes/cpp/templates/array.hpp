@@ -763,29 +763,29 @@ Array<T, N> take(const Array<T, N>& array, const Array<I, 1>& indices) {
     return taken(array, found);
 }
 
-/// Writes to the elements where a mask is true: a number, the elements of an array in their order, or a row to each row.
+/// Writes to the elements or rows where a mask is true: one number or row to all of them, or to each the next one.
 template <class T, int N, int M, class V>
 void put(const Array<T, N>& array, const Array<bool, M>& mask, const V& values) {
     check_mask(array, mask);
     // What is written may overlap with what is read.
     const auto source = astype<typename Traits<V>::Element>(values);
-    if constexpr (M == N && Traits<V>::rank == 1) {
-        const std::vector<Size> found = places(mask);
-        if (source.size() != 1 && source.size() != static_cast<Size>(found.size())) {
+    Operand<bool, N> wide{mask.data, {}};
+    std::copy(mask.strides.begin(), mask.strides.end(), wide.strides.begin());
+    if constexpr (Traits<V>::rank == N - M + 1) {
+        const bool is_whole = std::equal(array.shape.begin() + M, array.shape.end(), source.shape.begin() + 1);
+        const bool is_one = M == N && source.size() == 1;
+        if (!is_one && (!is_whole || source.shape[0] != static_cast<Size>(places(mask).size()))) {
             throw std::invalid_argument("NumPy boolean array indexing assignment: other number of values");
         }
         const auto* next = reinterpret_cast<const typename Traits<V>::Element*>(source.data);
-        const Size step = source.size() == 1 ? 0 : 1;
+        const Size step = is_one ? 0 : 1;
         for_each<N>(array.shape, [&](const T& place, bool is_set) {
             if (is_set) {
                 const_cast<T&>(place) = cast<T>(*next);
                 next += step;
             }
-        }, Operand<T, N>{array.data, array.strides}, Operand<bool, N>{mask.data, mask.strides});
+        }, Operand<T, N>{array.data, array.strides}, wide);
     } else {
-        static_assert(Traits<V>::rank <= N - M);
-        Operand<bool, N> wide{mask.data, {}};
-        std::copy(mask.strides.begin(), mask.strides.end(), wide.strides.begin());
         for_each<N>(array.shape, [](const T& place, bool is_set, const auto& value) {
             if (is_set) {
                 const_cast<T&>(place) = cast<T>(value);
