@@ -176,6 +176,7 @@ class _Call:
             is_part = getattr(self.scope.statement, "value", None) is not self.node
             refuse(is_part, f"cv2.{self.name} changes {name!r} in a part of an expression", self.node)
             writes(self.scope, given, self.node)
+            given = given if given.name else self.scope.hold("image", given)
             self.outputs.append(given)
             return self._in_out(given)
         is_optional = "default" in arg or "mask" in name.lower() or name == "kernel"
@@ -190,7 +191,6 @@ class _Call:
         kind = given.type
         if not isinstance(kind, t.ArrayType) or (kind.dtype and kind.dtype not in t.DEPTHS):
             raise ByHand(f"cv2.{self.name} changes {t.describe(kind)}", self.node)
-        refuse(not given.name, f"cv2.{self.name} changes an array that has no name", self.node)
         if not kind.is_mat:
             self.scope.helpers.add("array")
         return given.text if kind.is_mat else f"numpy::in_out({given.text})"

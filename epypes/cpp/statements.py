@@ -94,7 +94,8 @@ def function(
             kind = scope.returns[0] if scope.returns else t.NONE
             for other in scope.returns[1:]:
                 kind = joined(kind, other, node)
-            returned = t.kept(kind)
+            # While more becomes known of what is in lists, what it returns is not known yet.
+            returned = t.kept(kind) if refined == before[0] else None
         if (refined, returned) == before and returned is not None:
             return Translated(tuple(scope.declare()), returned, parameters, frozenset(scope.helpers))
     raise ByHand("its types are not clear", node)

@@ -880,6 +880,28 @@ def nested_input_in_place(groups):
     return groups[0][0]
 
 
+def listed_rows(image):
+    rows = []
+    for row in image:
+        if row[0] > 5:
+            rows.append(row)
+    return rows
+
+
+def rows_of_helper(image):
+    own = image.copy()
+    rows = listed_rows(own)
+    own[1] = 3
+    return rows[0], len(rows)
+
+
+def drawn_on_a_copy(image):
+    own = image.copy()
+    cv2.rectangle(own[1:], (1, 1), (2, 1), 70, -1)
+    drawn = cv2.rectangle(image.copy(), (1, 1), (2, 2), 200, -1)
+    return drawn, own
+
+
 def none_of_opencv(image):
     contours, hierarchy = cv2.findContours(image * 0, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
     one = np.zeros((5, 1, 2), np.float32)
@@ -1159,6 +1181,8 @@ INPUTS: dict[str, list[tuple[Any, ...]]] = {
     "written_after_transposed": _IMAGES,
     "written_after_nonzero": _IMAGES,
     "nested_input_in_place": [([[_GRID[0], _GRID[1]]],)],
+    "rows_of_helper": _IMAGES,
+    "drawn_on_a_copy": _IMAGES,
     "none_of_opencv": _IMAGES,
     "masked_rows": [(_COLOUR, _GRID), (_COLOUR[:3], _GRID[:3])],
     "several_names": _INTS,
