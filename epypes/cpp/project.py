@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FunctionType
@@ -26,8 +26,10 @@ class CppFunction:
         Its name in the graph; of one that is called, in Python.
     name
         Its name in C++.
-    signature
-        Its declaration without the semicolon.
+    returns
+        What it returns in C++.
+    parameters
+        The types and the names of its parameters in C++.
     lines
         Its body; None if it is written by hand.
     reason, line
@@ -38,7 +40,8 @@ class CppFunction:
 
     function: str
     name: str
-    signature: str = ""
+    returns: str = ""
+    parameters: Sequence[tuple[str, str]] = ()
     lines: Sequence[str] | None = None
     reason: str = ""
     line: str = ""
@@ -53,6 +56,18 @@ class CppFunction:
     def reason_with_line(self) -> str:
         """The reason, with the line that it is about."""
         return f"{self.reason}, in: {self.line}" if self.line else self.reason
+
+    @property
+    def signature(self) -> str:
+        """Its declaration without the semicolon."""
+        return f"{self.returns} {self.name}({', '.join(map(' '.join, self.parameters))})"
+
+    @property
+    def head(self) -> str:
+        """Its declaration, in which the parameters that its body does not use are marked."""
+        words = {*re.findall(r"\w+", "\n".join(self.lines or ()))}
+        marked = [f"{'' if name in words else '[[maybe_unused]] '}{kind} {name}" for kind, name in self.parameters]
+        return f"{self.returns} {self.name}({', '.join(marked)})"
 
 
 @dataclass(slots=True)
@@ -72,50 +87,38 @@ class Project:
             self.functions.append(self._function(name, function))
 
     def _function(self, name: str, function: Callable[..., Any]) -> CppFunction:
-        recording = self.recording
+        recording, plain = self.recording, plain_function(function)
         inputs, outputs = recording.inputs_of(name), recording.outputs_of(name)
-        wanted = (
-            outputs[0].type
-            if recording.bundle.cg.has_single_output(name)
-            else t.TupleType(tuple(each.type for each in outputs))
-        )
-        cpp = recording.functions[name]
-        plain = plain_function(function)
-        parameters = [each.name for each in inputs]
-        made = CppFunction(name, cpp)
+        is_single = recording.bundle.cg.has_single_output(name)
+        wanted = outputs[0].type if is_single else t.TupleType(tuple(each.type for each in outputs))
+        parameters = [(each.type.passed, each.name) for each in inputs]
+        made = CppFunction(name, recording.functions[name], wanted.cpp, parameters)
+        before, helpers = dict(self.called), set(self.helpers)
         source: Source | None = None
-        helpers: frozenset[str] = frozenset()
-        before = dict(self.called)
         try:
-            source = _call_of(name, function, parameters) if plain is None else source_of(plain)
-            given = _given(source.node, inputs)
+            source = _call_of(name, function, [each.name for each in inputs]) if plain is None else source_of(plain)
+            made.source = source.text
             self.stack = [plain] if plain is not None else []
-            found = translated_function(source.node, source.names, given, self._own, wanted)
-            made.lines, helpers = found.lines, found.helpers
-            parameters = [found.parameters[key] for key in given]
+            self._translate(made, source, _given(source.node, inputs), wanted)
         except ByHand as error:
             made.reason = str(error)
             made.line = source.line(error.line) if source is not None else ""
-            self.called = before
         except RecursionError:
             made.reason = "it is nested too deep"
-            self.called = before
-        made.source = source.text if source is not None else ""
-        self.helpers |= helpers
-        listed = [f"{each.type.passed} {parameter}" for each, parameter in zip(inputs, parameters, strict=True)]
-        made.signature = f"{wanted.cpp} {cpp}({', '.join(listed)})"
-        if made.lines is not None:
-            unused = [
-                parameter
-                for parameter in parameters
-                if not any(re.search(rf"\b{parameter}\b", line) for line in made.lines)
-            ]
-            listed = [
-                f"[[maybe_unused]] {text}" if parameter in unused else text
-                for text, parameter in zip(listed, parameters, strict=True)
-            ]
-            made.lines = [f"{wanted.cpp} {cpp}({', '.join(listed)}) {{", *made.lines, "}"]
+        if made.is_by_hand:
+            self.called, self.helpers = before, helpers
         return made
+
+    def _translate(
+        self, made: CppFunction, source: Source, given: Mapping[str, t.Type], wanted: t.Type | None = None
+    ) -> t.Type:
+        """Translate a function for the types of its arguments; return the type that it returns."""
+        found = translated_function(source.node, source.names, given, self._own, wanted)
+        names = found.parameters
+        made.returns, made.lines = found.returns.cpp, found.lines
+        made.parameters = [(kind.passed, names[name]) for name, kind in given.items() if name in names]
+        self.helpers |= found.helpers
+        return found.returns
 
     def _own(self, function: FunctionType, types: Sequence[t.Type], node: Any) -> tuple[str, t.Type]:
         """Translate a function that another one calls, for the types of its arguments."""
@@ -127,31 +130,21 @@ class Project:
         key = (function, *(each.cpp for each in types), *map(str, types))
         if key not in self.called:
             source: Source | None = None
+            made = CppFunction(function.__name__, "")
+            self.stack.append(function)
             try:
                 source = source_of(function)
                 names = [arg.arg for arg in source.node.args.args]
-                self.stack.append(function)
-                try:
-                    given = dict(zip(names, types, strict=True))
-                    found = translated_function(source.node, source.names, given, self._own)
-                finally:
-                    self.stack.pop()
+                returns = self._translate(made, source, dict(zip(names, types, strict=True)))
             except ByHand as error:
                 line = source.line(error.line) if source is not None else ""
                 raise ByHand(f"it calls {function.__name__}: {error}{line and f', in: {line}'}") from None
+            finally:
+                self.stack.pop()
             taken = [each.name for each, _ in self.called.values()] + [*self.recording.functions.values()]
-            cpp = t.identifiers(
-                [function.__name__], [*taken, *(token.name for token in self.recording.tokens.values())]
-            )[function.__name__]
-            listed = [
-                f"{kind.passed} {found.parameters[name]}"
-                for name, kind in zip(names, types, strict=True)
-                if name in found.parameters
-            ]
-            head = f"{found.returns.cpp} {cpp}({', '.join(listed)})"
-            made = CppFunction(function.__name__, cpp, head, [f"{head} {{", *found.lines, "}"], source=source.text)
-            self.helpers |= found.helpers
-            self.called[key] = made, found.returns
+            taken += [token.name for token in self.recording.tokens.values()]
+            made.name = t.identifiers([function.__name__], taken)[function.__name__]
+            self.called[key] = made, returns
         made, kind = self.called[key]
         return made.name, kind
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes import __version__
 from epypes.cpp import types as t
-from epypes.cpp.project import CppFunction, Project
+from epypes.cpp.project import Project
 from epypes.cpp.samples import write_sample
 from epypes.errors import BundleError
 from epypes.optional import optional_import
@@ -95,7 +95,7 @@ def _templates(project: Project) -> Environment:
     )  # fmt: skip
     templates.filters |= {
         "quoted": t.quoted, "json": json.dumps, "one_line": _one_line, "wrapped": _wrapped, "initial": _initial,
-        "head_without_names": _head_without_names, "source": functools.partial(_source, project)
+        "source": functools.partial(_source, project)
     }  # fmt: skip
     # As in: kind is ListType.
     kinds = t.Type.__subclasses__()
@@ -263,11 +263,6 @@ def _types_of(signature: str) -> tuple[str, ...]:
     named = r"(?<=[\w&*\]])(?:\s+|(?<=[&*\]]))(?!(?:int|bool|float|double)$)\w+$"
     parts = (head, *(re.sub(named, "", each.strip()) for each in parameters.split(",")))
     return tuple(re.sub(r"\s*(\W)\s*", r"\1", each.strip()) for each in parts)
-
-
-def _head_without_names(function: CppFunction) -> str:
-    """Return the head of a function whose parameters are not used yet."""
-    return re.sub(r" (\w+)(?=[,)])(?=(?:[^<>]|<[^<>]*>)*$)", r" /*\1*/", function.signature)
 
 
 def namespace_of(project: Project) -> str:

@@ -17,7 +17,9 @@ namespace @{ns} {
 {% for line in function.source.splitlines() %}
 @{("//     " ~ line).rstrip()}
 {% endfor %}
-@{function | head_without_names} {
+@{function.returns} @{function.name}(
+{%- for kind, name in function.parameters %}@{kind} /*@{name}*/@{", " if not loop.last}{% endfor -%}
+) {
     throw std::logic_error(@{(function.name ~ " is still to be written by hand: see " ~ by_hand) | quoted});
 }
 

@@ -63,14 +63,18 @@ std::optional<T> owned(const std::optional<T>& value) {
 namespace {
 
 {% for function in called %}
+@{function.head} {
 @{function.lines | join("\n")}
+}
 
 {% endfor %}
 }  // namespace
 
 {% endif %}
 {% for function in functions if not function.is_by_hand %}
+@{function.head} {
 @{function.lines | join("\n")}
+}
 
 {% endfor %}
 void Hyperparameters::check() const {
