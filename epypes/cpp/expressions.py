@@ -316,8 +316,10 @@ def _is_none(scope: Scope, left: Expr, right: Expr, node: Any, *, is_not: bool) 
         return written(not is_not, "", node)
     refuse(isinstance(left.type, t.OptionalType), f"a value that is {t.describe(left.type)}", node)
     kind = left.type
-    # What OpenCV makes may be empty, of which Python has None, also where no table says so.
-    if isinstance(kind, t.ArrayType) and kind.is_mat and (kind.is_nullable or not kind.is_readonly):
+    if isinstance(kind, t.ArrayType) and kind.is_mat and not kind.is_readonly:
+        # What OpenCV makes may be empty, of which Python has None, also where no table says so.
+        return Expr(f"{'!' if is_not else ''}{left.atom}.empty()", t.BOOL)
+    if isinstance(kind, t.ArrayType) and kind.is_mat and (kind.is_nullable or not kind.dtype):
         scope.helpers.add("python")
         return Expr(f"{'!' if is_not else ''}python::is_none({left.text})", t.BOOL)
     return written(is_not, "", node)

@@ -209,6 +209,8 @@ class _Call:
                 # As a row per item with its numbers in columns or in channels, whichever this version of OpenCV makes.
                 rows = f"static_cast<int>({temporary}.total()) * {temporary}.channels() / {size}"
                 self.after.append(f"{temporary} = {temporary}.reshape({1 if _has_rows() else size}, {rows});")
+            if self._rule(index).get("release"):
+                self.after.append(f"{temporary} = {temporary}.empty() ? cv::Mat() : {temporary};")
         elif kind in ("vector<KeyPoint>", "vector<DMatch>", "vector<vector<DMatch>>"):
             inner: t.Type = t.RecordType("KeyPoint" if "Key" in kind else "DMatch")
             inner = t.ListType(inner, is_tuple=True) if kind.count("vector") == 2 else inner

@@ -38,8 +38,6 @@ class Recording:
         The tokens in C++, by name.
     runs
         The values of all tokens by sample; a state between runs is under the name of the delayed token.
-    after
-        The state after each run, by sample and token that has it.
     functions
         The names of the functions in C++, in run order.
     """

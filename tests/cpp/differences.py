@@ -906,8 +906,10 @@ def none_of_opencv(image):
     contours, hierarchy = cv2.findContours(image * 0, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
     one = np.zeros((5, 1, 2), np.float32)
     found, _ = cv2.findHomography(one, one)
-    part = cv2.intersectConvexConvex(one[:3], one[:3] + 5)[1]
-    return hierarchy is None, found is None, 1 if part is None else 2, image is None, cv2.blur(image, (3, 3)) is not None
+    part, lines = cv2.intersectConvexConvex(one[:3], one[:3] + 5)[1], cv2.HoughLines(image * 0, 1, 0.1, 99)
+    kept = lines if lines is not None else cv2.HoughLines(image * 0 + 255, 1, 0.1, 2)
+    made = hierarchy is None, found is None, 1 if part is None else 2, lines is None, kept is None
+    return *made, image is None, cv2.blur(image, (3, 3)) is not None, float(kept[0, 0, 1])
 
 
 def masked_rows(colour, image):
