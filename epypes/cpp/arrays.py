@@ -20,7 +20,6 @@ def as_array(scope: Scope, given: Expr, node: Any) -> Expr:
     """Return an array as an Array of C++, which shares the memory of a cv::Mat."""
     kind = given.type
     refuse(not isinstance(kind, t.ArrayType), f"an array is needed, not {t.describe(kind)}", node)
-    scope.helpers.add("array")
     if not kind.is_mat:
         return given
     refuse(not kind.dtype or kind.ndim not in (2, 3), "the dtype or the dimensions of an array are not known", node)
@@ -92,7 +91,6 @@ def fitting(scope: Scope, given: Expr, dtype: str, node: Any) -> str:
     if isinstance(kind, t.Int) and limits.min <= kind.low and kind.high <= limits.max:
         return given.text if given.value is not UNKNOWN else f"static_cast<{t.ELEMENTS[dtype]}>({given.text})"
     refuse(given.value is not UNKNOWN, f"{given.value} is out of bounds for {dtype}", node)
-    scope.helpers.add("python")
     return f"python::narrow<{t.ELEMENTS[dtype]}>({given.text})"
 
 
@@ -117,7 +115,6 @@ def joint_type(dtype: str, operands: Sequence[Expr]) -> t.Type:
 
 def calculate(scope: Scope, name: str, operands: Sequence[Expr], node: Any) -> Expr:
     """Return what a function of NumPy makes of its operands, element by element."""
-    scope.helpers.add("array")
     inner, outer = resolved(name, operands, node)
     is_compared = name in t.data("numpy")["ufuncs"]["compared"]
     given = [operand(scope, each, inner, node, is_compared=is_compared) for each in operands]
@@ -157,7 +154,6 @@ def attribute(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
         return Expr(f"numpy::transpose({as_array(scope, owner, node).text})", transposed)
     if name == "shape" and kind.is_mat:
         if kind.is_nullable:
-            scope.helpers.add("python")
             owner = replace(owner, text=f"python::required({owner.text})")
         sizes = [f"{owner.atom}.rows", f"{owner.atom}.cols", f"{owner.atom}.channels()"]
         # Of an image whose dimensions aren't known, the height and the width are.
@@ -372,7 +368,6 @@ def fitted(scope: Scope, value: Expr, wanted: t.ArrayType, node: Any) -> str:
         return value.text
     is_other = own.is_mat and wanted.ndim not in (2, 3)
     refuse(is_other, f"OpenCV makes {t.describe(wanted)}, which has another shape in OpenCV 4", node)
-    scope.helpers.add("array")
     if wanted.is_mat:
         return f"numpy::mat({value.text})"
     return f"numpy::array<{t.ELEMENTS[wanted.dtype]}, {wanted.ndim}>({value.text})"

@@ -225,7 +225,6 @@ def _of_numbers(scope: Scope, operator: ast.operator, left: Expr, right: Expr, n
         kind = t.FLOAT if isinstance(operator, ast.Div) else t.Int(max(low, t.LOW), min(high, t.HIGH))
     if is_plain:
         return Expr(f"{left.atom} {sign or '/'} {right.atom}", kind, is_atom=False)
-    scope.helpers.add("python")
     return Expr(f"python::{name}({left.text}, {right.text})", kind)
 
 
@@ -320,7 +319,6 @@ def _is_none(scope: Scope, left: Expr, right: Expr, node: Any, *, is_not: bool) 
         # What OpenCV makes may be empty, of which Python has None, also where no table says so.
         return Expr(f"{'!' if is_not else ''}{left.atom}.empty()", t.BOOL)
     if isinstance(kind, t.ArrayType) and kind.is_mat and (kind.is_nullable or not kind.dtype):
-        scope.helpers.add("python")
         return Expr(f"{'!' if is_not else ''}python::is_none({left.text})", t.BOOL)
     return written(is_not, "", node)
 
@@ -440,7 +438,6 @@ def _subscript(scope: Scope, node: Any) -> Expr:
             raise ByHand("an index into a tuple that is not written out", node)
         return parts[index.value]
     if isinstance(owner.type, t.ListType) and owner.type.item != t.NONE:
-        scope.helpers.add("python")
         return Expr(f"python::at({owner.text}, {index.text})", owner.type.item)
     raise ByHand(f"an item of {t.describe(owner.type)}", node)
 
@@ -462,7 +459,6 @@ def _sliced(scope: Scope, owner: Expr, node: ast.Subscript) -> Expr:
     low, high = (
         end.text if end is not None else default for end, default in zip(ends, ("0", "python::end"), strict=True)
     )
-    scope.helpers.add("python")
     return Expr(f"python::slice({owner.text}, {low}, {high})", owner.type)
 
 

@@ -81,7 +81,6 @@ def _range(scope: Scope, node: Any, names: Sequence[str]) -> Iteration:
     sign = "<" if step > 0 else ">"
     pace = f"++{name}" if step == 1 else f"--{name}" if step == -1 else f"{name} += {step}"
     if abs(step) > 1 and not (all(end.is_within(62) for end in ends) and abs(step) < 2**62):
-        scope.helpers.add("python")
         pace = f"{name} = python::add({name}, {step})"
     kind = t.Int(ends[0].low, max(ends[1].high - 1, ends[0].low))
     if step < 0:
@@ -302,7 +301,6 @@ def call(scope: Scope, name: str, node: Any) -> Expr:
     known = {"sorted": {"key", "reverse"}, "min": {"key"}, "max": {"key"}}.get(name, set())
     translator = _FUNCTIONS.get(name) or _OF_SEQUENCES.get(name)
     refuse(translator is None or not node.args or options.keys() - known, f"{name}() with these arguments", node)
-    scope.helpers.add("python")
     if name in _FUNCTIONS:
         refuse(len(node.args) > 1, f"{name}() with these arguments", node)
         return _FUNCTIONS[name](scope, value_of(scope, node.args[0]), node)
@@ -324,7 +322,6 @@ def of_math(scope: Scope, name: str, node: Any) -> Expr:
     count = 2 if name in ("atan2", "copysign") else 1
     refuse(named or len(given) != count or not all(is_number(each.type) for each in given), f"math.{name}", node)
     first = given[0]
-    scope.helpers.add("python")
     if name in ("floor", "ceil", "trunc"):
         whole = _whole(first)
         return whole if isinstance(whole.type, t.Int) else Expr(f"python::integer(std::{name}({first.text}))", t.Int())

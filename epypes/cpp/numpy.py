@@ -19,7 +19,6 @@ def call(scope: Scope, function: Any, name: str, node: Any) -> Expr:
     """Translate a call of a function of NumPy."""
     import numpy as np
 
-    scope.helpers.add("array")
     if isinstance(function, type) and issubclass(function, np.generic):
         return _converted(scope, np.dtype(function).name, node)
     given, named = arguments(scope, node)
@@ -51,7 +50,6 @@ def _listed(node: Any) -> str:
 
 def method(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
     """Translate a call of a method of an array or a number of NumPy."""
-    scope.helpers.add("array")
     given, named = arguments(scope, node)
     is_array = isinstance(owner.type, t.ArrayType)
     if name == "astype" and len(given) == 1 and not named:

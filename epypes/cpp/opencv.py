@@ -191,8 +191,6 @@ class _Call:
         kind = given.type
         if not isinstance(kind, t.ArrayType) or (kind.dtype and kind.dtype not in t.DEPTHS):
             raise ByHand(f"cv2.{self.name} changes {t.describe(kind)}", self.node)
-        if not kind.is_mat:
-            self.scope.helpers.add("array")
         return given.text if kind.is_mat else f"numpy::in_out({given.text})"
 
     def _output(self, kind: str, name: str) -> str:
@@ -337,7 +335,6 @@ def narrow(scope: Scope, given: Expr) -> str:
     if isinstance(own, t.Int) and own.is_within(31):
         is_plain = own.is_int or given.value is not UNKNOWN
         return given.text if is_plain else f"static_cast<int>({given.text})"
-    scope.helpers.add("python")
     return f"python::narrow<int>({given.text})"
 
 
@@ -370,10 +367,8 @@ def _input(scope: Scope, given: Expr, node: Any, *, is_optional: bool) -> str:
     if isinstance(own, t.ArrayType):
         refuse(own.dtype and own.dtype not in t.DEPTHS, f"OpenCV does not take an array of {own.dtype}", node)
         if not own.is_mat:
-            scope.helpers.add("array")
             return f"numpy::mat({given.text})"
         if own.is_nullable and not is_optional:
-            scope.helpers.add("python")
             return f"python::required({given.text})"
         return given.text
     if given.parts and all(isinstance(part.type, t.ArrayType) for part in given.parts):

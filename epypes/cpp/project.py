@@ -77,7 +77,6 @@ class Project:
     recording: Recording
     functions: list[CppFunction] = field(default_factory=list)
     called: dict[tuple[Any, ...], tuple[CppFunction, t.Type]] = field(default_factory=dict)
-    helpers: set[str] = field(default_factory=set)
     stack: list[FunctionType] = field(default_factory=list)
 
     def translate(self) -> None:
@@ -93,7 +92,7 @@ class Project:
         wanted = outputs[0].type if is_single else t.TupleType(tuple(each.type for each in outputs))
         parameters = [(each.type.passed, each.name) for each in inputs]
         made = CppFunction(name, recording.functions[name], wanted.cpp, parameters)
-        before, helpers = dict(self.called), set(self.helpers)
+        before = dict(self.called)
         source: Source | None = None
         try:
             source = _call_of(name, function, [each.name for each in inputs]) if plain is None else source_of(plain)
@@ -106,7 +105,7 @@ class Project:
         except RecursionError:
             made.reason = "it is nested too deep"
         if made.is_by_hand:
-            self.called, self.helpers = before, helpers
+            self.called = before
         return made
 
     def _translate(
@@ -117,7 +116,6 @@ class Project:
         names = found.parameters
         made.returns, made.lines = found.returns.cpp, found.lines
         made.parameters = [(kind.passed, names[name]) for name, kind in given.items() if name in names]
-        self.helpers |= found.helpers
         return found.returns
 
     def _own(self, function: FunctionType, types: Sequence[t.Type], node: Any) -> tuple[str, t.Type]:

@@ -160,7 +160,6 @@ class Scope:
         self.used: set[str] = set()
         self.variables: dict[tuple[str, str], Variable] = {}
         self.returns: list[t.Type] = []
-        self.helpers: set[str] = set()
         # By loop: the names where it is left, and where its next turn begins.
         self.loops: list[tuple[list[dict[str, Binding]], list[dict[str, Binding]]]] = []
         # The dtypes of the arrays that are written to, and those of which a view in NumPy may be a copy in C++.

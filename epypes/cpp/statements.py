@@ -37,12 +37,11 @@ _READERS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Translated:
-    """A function in C++: its lines between the braces, what it returns, and the helpers that it needs."""
+    """A function in C++: its lines between the braces, what it returns, and the names of its parameters."""
 
     lines: tuple[str, ...]
     returns: t.Type
     parameters: Mapping[str, str]
-    helpers: frozenset[str]
 
 
 def function(
@@ -97,7 +96,7 @@ def function(
             # While more becomes known of what is in lists, what it returns is not known yet.
             returned = t.kept(kind) if refined == before[0] else None
         if (refined, returned) == before and returned is not None:
-            return Translated(tuple(scope.declare()), returned, parameters, frozenset(scope.helpers))
+            return Translated(tuple(scope.declare()), returned, parameters)
     raise ByHand("its types are not clear", node)
 
 
@@ -322,7 +321,6 @@ def unpacked(scope: Scope, value: Expr, count: int, node: Any) -> Sequence[Expr]
     if not parts and isinstance(value.type, t.ArrayType):
         return arrays.unpacked(scope, value, count, node)
     if not parts and isinstance(value.type, t.ListType) and value.type.item != t.NONE:
-        scope.helpers.add("python")
         name = value.text
         if not value.name:
             name = scope.hold("items", value).text

@@ -78,8 +78,7 @@ def _is_own(folder: Path) -> bool:
 def _is_needed(name: str, values: Mapping[str, Any]) -> bool:
     """Whether a project has a file."""
     if name in ("array.hpp", "python.hpp"):
-        needed = {"array", name.removesuffix(".hpp")}
-        return bool(values["has_arrays"] or needed & values["helpers"])
+        return bool(values["has_arrays"] or {"array.hpp", name} & {*values["includes"]})
     is_array = name == f"{_SERVICE}arrays.hpp"
     return not name.startswith(_SERVICE) or bool(values["is_served"] and (values["has_served_arrays"] or not is_array))
 
@@ -113,6 +112,7 @@ def _values(project: Project, is_served: bool) -> dict[str, Any]:
         text = f"An event can't bring {odd[0].token!r} to a service in C++, nor an answer carry it"
         raise BundleError(settings.name, f"{text}: {t.describe(odd[0].type)}.")
     called = [each for each, _ in project.called.values()]
+    code = "\n".join(line for each in (*called, *project.functions) for line in each.lines or ())
     begins = {**settings.hyperparameters, **{token: delay.initial for token, delay in cg.delays.items()}}
     members = [
         *(each.cpp for each in tokens.values()),
@@ -131,7 +131,7 @@ def _values(project: Project, is_served: bool) -> dict[str, Any]:
         "cg": cg,
         "functions": project.functions,
         "called": called,
-        "helpers": project.helpers,
+        "includes": [f"{name}.hpp" for name, mark in (("array", "numpy::"), ("python", "python::")) if mark in code],
         "hyperparameters": recording.hyperparameters,
         "inputs": inputs,
         "outputs": outputs,

@@ -9,15 +9,12 @@
 #include <utility>
 
 #include <opencv2/opencv.hpp>
-{% if "array" in helpers or "python" in helpers %}
+{% if includes %}
 
 {% endif %}
-{% if "array" in helpers %}
-#include "array.hpp"
-{% endif %}
-{% if "python" in helpers %}
-#include "python.hpp"
-{% endif %}
+{% for name in includes %}
+#include "@{name}"
+{% endfor %}
 
 namespace @{ns} {
 
