@@ -16,7 +16,7 @@ from epypes.cpp.scope import UNKNOWN, ByHand, Expr, Scope, is_number, refuse, wr
 SIZE: Final = t.Int(0, 2**31 - 1)
 
 
-def as_array(scope: Scope, given: Expr, node: Any) -> Expr:
+def as_array(given: Expr, node: Any) -> Expr:
     """Return an array as an Array of C++, which shares the memory of a cv::Mat."""
     kind = given.type
     refuse(not isinstance(kind, t.ArrayType), f"an array is needed, not {t.describe(kind)}", node)
@@ -72,17 +72,17 @@ def _clipped(given: Sequence[Any], node: Any) -> list[Any]:
     return [given[0], float if float in given else int if int in given else given[0]]
 
 
-def operand(scope: Scope, given: Expr, dtype: str, node: Any, *, is_compared: bool = False) -> Expr:
+def operand(given: Expr, dtype: str, node: Any, *, is_compared: bool = False) -> Expr:
     """Return an operand of a calculation in a dtype; an integer of Python that does not fit raises, as in NumPy."""
     kind = given.type
     if isinstance(kind, t.ArrayType):
-        return as_array(scope, given, node)
+        return as_array(given, node)
     if not isinstance(kind, t.Int) or is_compared or "int" not in dtype:
         return given
-    return Expr(fitting(scope, given, dtype, node), t.number(dtype))
+    return Expr(fitting(given, dtype, node), t.number(dtype))
 
 
-def fitting(scope: Scope, given: Expr, dtype: str, node: Any) -> str:
+def fitting(given: Expr, dtype: str, node: Any) -> str:
     """Return an integer of Python as an element, one that is written out as it is."""
     import numpy as np
 
@@ -94,9 +94,9 @@ def fitting(scope: Scope, given: Expr, dtype: str, node: Any) -> str:
     return f"python::narrow<{t.ELEMENTS[dtype]}>({given.text})"
 
 
-def as_element(scope: Scope, given: Expr, dtype: str, node: Any) -> str:
+def as_element(given: Expr, dtype: str, node: Any) -> str:
     """Return an integer of Python as an element that has its type in C++."""
-    text = fitting(scope, given, dtype, node)
+    text = fitting(given, dtype, node)
     return text if given.value is UNKNOWN else f"static_cast<{t.ELEMENTS[dtype]}>({text})"
 
 
@@ -113,30 +113,30 @@ def joint_type(dtype: str, operands: Sequence[Expr]) -> t.Type:
     return made(dtype, ndim, channels.pop() if len(channels) == 1 else 0, operands)
 
 
-def calculate(scope: Scope, name: str, operands: Sequence[Expr], node: Any) -> Expr:
+def calculate(name: str, operands: Sequence[Expr], node: Any) -> Expr:
     """Return what a function of NumPy makes of its operands, element by element."""
     inner, outer = resolved(name, operands, node)
     is_compared = name in t.data("numpy")["ufuncs"]["compared"]
-    given = [operand(scope, each, inner, node, is_compared=is_compared) for each in operands]
+    given = [operand(each, inner, node, is_compared=is_compared) for each in operands]
     element = t.ELEMENTS[inner if is_compared else outer]
     function = "negated" if name == "negative" and "float" in outer else f"{name}<{element}>"
     return Expr(f"numpy::{function}({', '.join(each.text for each in given)})", joint_type(outer, given))
 
 
-def binary(scope: Scope, operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
+def binary(operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
     """Return the result of an operator."""
     name = t.operator(operator).get("numpy")
     if isinstance(operator, ast.Pow) and isinstance(left.type, t.ArrayType) and right.value == 2:
-        return calculate(scope, "square", [left], node)
+        return calculate("square", [left], node)
     if name is None:
         raise ByHand(f"{type(operator).__name__} of arrays", node)
-    return calculate(scope, name, [left, right], node)
+    return calculate(name, [left, right], node)
 
 
 # -- subscripts --------------------------------------------------------------------------------------------------------
 
 
-def attribute(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
+def attribute(owner: Expr, name: str, node: Any) -> Expr:
     """Return an attribute of an array."""
     import numpy as np
 
@@ -151,7 +151,7 @@ def attribute(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
         return written(kind.ndim, name, node)
     if name == "T":
         transposed = replace(kind, is_mat=False, channels=0, is_strided=kind.ndim > 1)
-        return Expr(f"numpy::transpose({as_array(scope, owner, node).text})", transposed)
+        return Expr(f"numpy::transpose({as_array(owner, node).text})", transposed)
     if name == "shape" and kind.is_mat:
         if kind.is_nullable:
             owner = replace(owner, text=f"python::required({owner.text})")
@@ -160,7 +160,7 @@ def attribute(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
         parts = [Expr(size, replace(SIZE, is_int=True)) for size in sizes[: kind.ndim if kind.ndim > 0 else 2]]
         return replace(tuple_of(parts), name="" if kind.ndim > 0 else "shape of unknown length")
     if name in ("shape", "size"):
-        array = as_array(scope, owner, node)
+        array = as_array(owner, node)
         if name == "size":
             return Expr(f"{array.text}.size()", t.Int(0, 2**62))
         return tuple_of([Expr(f"{array.text}.shape[{axis}]", SIZE) for axis in range(kind.ndim)])
@@ -233,14 +233,14 @@ def _selector(scope: Scope, part: ast.expr, node: Any) -> Expr | None:
     size = len(scope.block.items)
     found = value_of(scope, part)
     if isinstance(found.type, t.ArrayType):
-        return as_array(scope, found, node)
+        return as_array(found, node)
     del scope.block.items[size:]
     return None
 
 
 def subscript(scope: Scope, owner: Expr, part: ast.expr, node: Any) -> Expr:
     """Return an element, a view or the elements that a mask or indices select."""
-    array = as_array(scope, owner, node)
+    array = as_array(owner, node)
     kind = array.type
     selector = _selector(scope, part, node)
     if selector is not None:
@@ -272,7 +272,7 @@ def subscript(scope: Scope, owner: Expr, part: ast.expr, node: Any) -> Expr:
 def store(scope: Scope, owner: Expr, target: ast.Subscript, value: Expr, node: Any) -> None:
     """Assign to an element, a view or the elements of a mask."""
     writes(scope, owner, node)
-    array = as_array(scope, owner, node)
+    array = as_array(owner, node)
     kind = array.type
     text = _stored(scope, kind, value, node)
     selector = _selector(scope, target.slice, node)
@@ -306,9 +306,9 @@ def _stored(scope: Scope, kind: t.ArrayType, value: Expr, node: Any) -> str:
         texts = [_stored(scope, kind, part, node) for part in value.parts]
         return f"numpy::array<{element}, 1>({{{len(texts)}}}, {{{', '.join(texts)}}})"
     if isinstance(value.type, t.ArrayType):
-        return as_array(scope, value, node).text
+        return as_array(value, node).text
     if isinstance(value.type, t.Int) and "int" in kind.dtype:
-        return as_element(scope, value, kind.dtype, node)
+        return as_element(value, kind.dtype, node)
     refuse(not is_number(value.type), f"{t.describe(value.type)} is assigned to a part of an array", node)
     source = {t.FLOAT: "float64", t.BOOL: "bool"}.get(value.type) or value.type.dtype or "int64"
     is_safe = np.can_cast(source, kind.dtype, "same_kind" if source == "float64" else "safe")
@@ -322,13 +322,13 @@ def augmented(scope: Scope, left: Expr, operator: ast.operator, right: Expr, nod
     import numpy as np
 
     writes(scope, left, node)
-    found = binary(scope, operator, left, right, node)
+    found = binary(operator, left, right, node)
     kind = left.type
     if not isinstance(kind, t.ArrayType) or not isinstance(found.type, t.ArrayType) or found.type.ndim != kind.ndim:
         raise ByHand("an operator in place that changes the dimensions", node)
     if not np.can_cast(found.type.dtype, kind.dtype, "same_kind"):
         raise ByHand(f"an operator in place that makes {found.type.dtype} of {kind.dtype}", node)
-    scope.emit(f"numpy::assign({as_array(scope, left, node).text}, {found.text});")
+    scope.emit(f"numpy::assign({as_array(left, node).text}, {found.text});")
 
 
 def augmented_item(scope: Scope, owner: Expr, node: Any, value: Expr) -> None:
@@ -336,12 +336,12 @@ def augmented_item(scope: Scope, owner: Expr, node: Any, value: Expr) -> None:
     if any(isinstance(each, ast.Call) for each in ast.walk(node.target)):
         raise ByHand("a call in the target of an operator in place", node)
     before = subscript(scope, owner, node.target.slice, node)
-    store(scope, owner, node.target, binary(scope, node.op, before, value, node), node)
+    store(scope, owner, node.target, binary(node.op, before, value, node), node)
 
 
 def unpacked(scope: Scope, value: Expr, count: int, node: Any) -> Sequence[Expr]:
     """Return the rows of an array that is unpacked."""
-    array = as_array(scope, value, node)
+    array = as_array(value, node)
     kind = array.type
     refuse(not isinstance(kind, t.ArrayType) or kind.ndim < 1, "an array of unknown dimensions is unpacked", node)
     name = scope.hold("rows", array).text
@@ -359,7 +359,7 @@ def row(name: str, kind: t.ArrayType, index: str) -> Expr:
     )
 
 
-def fitted(scope: Scope, value: Expr, wanted: t.ArrayType, node: Any) -> str:
+def fitted(value: Expr, wanted: t.ArrayType, node: Any) -> str:
     """Return an array in the form that a function has to return."""
     own = value.type
     if wanted.dtype and own.dtype and (own.dtype != wanted.dtype or (own.ndim >= 0 and own.ndim != wanted.ndim)):

@@ -95,7 +95,7 @@ def _attribute(scope: Scope, node: Any) -> Expr:
         refuse(not kind, f"the attribute {node.attr!r} of a {owner.type.name}", node)
         return opencv.member(f"{owner.atom}.{node.attr}", kind)
     if isinstance(owner.type, t.ArrayType):
-        return arrays.attribute(scope, owner, node.attr, node)
+        return arrays.attribute(owner, node.attr, node)
     raise ByHand(f"the attribute {node.attr!r} of {t.describe(owner.type)}", node)
 
 
@@ -148,7 +148,7 @@ def list_of(scope: Scope, parts: list[Expr], node: ast.expr) -> Expr:
     if kind == t.NONE:
         return Expr("{}", whole, parts=())
     if isinstance(kind, t.ArrayType) and not kind.is_mat:
-        parts = [arrays.as_array(scope, part, node) for part in parts]
+        parts = [arrays.as_array(part, node) for part in parts]
     return Expr(f"{whole.cpp}{{{', '.join(part.text for part in parts)}}}", whole, parts=tuple(parts))
 
 
@@ -177,17 +177,17 @@ def widened(given: Expr) -> Expr:
     return given
 
 
-def binary(scope: Scope, operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
+def binary(operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
     """Return the result of an operator."""
     if left.value is not UNKNOWN and right.value is not UNKNOWN and left.parts is None and right.parts is None:
         return _folded(operator, left, right, node)
     if is_of_numpy(left) or is_of_numpy(right):
-        return arrays.binary(scope, operator, left, right, node)
+        return arrays.binary(operator, left, right, node)
     if not all(isinstance(side.type, t.Int) or side.type in (t.FLOAT, t.BOOL) for side in (left, right)):
         raise ByHand(f"{t.describe(left.type)} {type(operator).__name__} {t.describe(right.type)}", node)
     if left.type == right.type == t.BOOL and isinstance(operator, ast.BitAnd | ast.BitOr | ast.BitXor):
         return Expr(f"static_cast<bool>({left.atom} {t.operator(operator)['sign']} {right.atom})", t.BOOL)
-    return _of_numbers(scope, operator, left, right, node)
+    return _of_numbers(operator, left, right, node)
 
 
 def is_of_numpy(given: Expr) -> bool:
@@ -210,7 +210,7 @@ def _folded(operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
     return written(value, "", node)
 
 
-def _of_numbers(scope: Scope, operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
+def _of_numbers(operator: ast.operator, left: Expr, right: Expr, node: Any) -> Expr:
     """Return the result of an operator on Python's numbers: by C++'s own where that gives the same for all values."""
     left, right, table = widened(left), widened(right), t.operator(operator)
     name, sign, is_float = table.get("python"), table.get("sign"), t.FLOAT in (left.type, right.type)
@@ -243,7 +243,7 @@ def _range(operator: ast.operator, one: t.Int, other: t.Int) -> tuple[int, int]:
 
 def _binary(scope: Scope, node: Any) -> Expr:
     left = value_of(scope, node.left)
-    return binary(scope, node.op, left, value_of(scope, node.right), node)
+    return binary(node.op, left, value_of(scope, node.right), node)
 
 
 def _unary(scope: Scope, node: Any) -> Expr:
@@ -253,7 +253,7 @@ def _unary(scope: Scope, node: Any) -> Expr:
         return Expr(f"!{found.atom}", t.BOOL, value)
     given = value_of(scope, node.operand)
     if is_of_numpy(given):
-        return arrays.calculate(scope, t.operator(node.op)["numpy"], [given], node)
+        return arrays.calculate(t.operator(node.op)["numpy"], [given], node)
     if given.value is not UNKNOWN and isinstance(node.op, ast.USub) and is_number(given.type):
         return written(-given.value, "", node)
     refuse(given.type != t.FLOAT and not isinstance(widened(given).type, t.Int), f"{ast.unparse(node):.60}", node)
@@ -265,7 +265,7 @@ def _unary(scope: Scope, node: Any) -> Expr:
         return Expr(f"-{given.atom}", t.FLOAT, is_atom=False)
     if isinstance(node.op, ast.Invert):
         return Expr(f"~{whole.atom}", t.Int(-whole.type.high - 1, -whole.type.low - 1), is_atom=False)
-    return binary(scope, ast.Sub(), written(0, "", node), whole, node)
+    return binary(ast.Sub(), written(0, "", node), whole, node)
 
 
 def _compare(scope: Scope, node: Any) -> Expr:
@@ -287,12 +287,12 @@ def _compare(scope: Scope, node: Any) -> Expr:
 
 def _compared(scope: Scope, operator: ast.cmpop, left: Expr, right: Expr, node: Any) -> Expr:
     if isinstance(operator, ast.Is | ast.IsNot):
-        return _is_none(scope, left, right, node, is_not=isinstance(operator, ast.IsNot))
+        return _is_none(left, right, node, is_not=isinstance(operator, ast.IsNot))
     if isinstance(operator, ast.In | ast.NotIn):
         return _contained(scope, left, right, node, is_not=isinstance(operator, ast.NotIn))
     sign = t.operator(operator)["sign"]
     if is_of_numpy(left) or is_of_numpy(right):
-        return arrays.calculate(scope, t.operator(operator)["numpy"], [left, right], node)
+        return arrays.calculate(t.operator(operator)["numpy"], [left, right], node)
     if left.parts is not None or right.parts is not None or isinstance(left.type, t.TupleType):
         one, other = opencv.items(left), opencv.items(right)
         if isinstance(operator, ast.Eq) and len(one) == len(other) > 0:
@@ -309,7 +309,7 @@ def _compared(scope: Scope, operator: ast.cmpop, left: Expr, right: Expr, node: 
     return Expr(f"{left.atom} {sign} {right.atom}", t.BOOL, is_atom=False)
 
 
-def _is_none(scope: Scope, left: Expr, right: Expr, node: Any, *, is_not: bool) -> Expr:
+def _is_none(left: Expr, right: Expr, node: Any, *, is_not: bool) -> Expr:
     refuse(right.value is not None, "objects are compared by `is`", node)
     if left.value is None:
         return written(not is_not, "", node)
@@ -408,7 +408,7 @@ def _if_exp(scope: Scope, node: Any) -> Expr:
     scope.env = saved
     kind = joined(one.type, other.type, node)
     if isinstance(kind, t.ArrayType) and not kind.is_mat:
-        one, other = arrays.as_array(scope, one, node), arrays.as_array(scope, other, node)
+        one, other = arrays.as_array(one, node), arrays.as_array(other, node)
     if isinstance(kind, t.Int):
         kind = replace(kind, is_int=False)
         one, other = (side if side.type.cpp == "std::int64_t" else widened(side) for side in (one, other))

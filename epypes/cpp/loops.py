@@ -106,7 +106,7 @@ def _sequence(scope: Scope, given: Expr, node: Any) -> tuple[str, Callable[[str]
         name = _named(scope, given)
         return f"{name}.size()", lambda index: Expr(f"{name}[{index}]", kind.item, name=f"{name}[]")
     refuse(not isinstance(kind, t.ArrayType), f"a loop over {t.describe(kind)}", node)
-    rows = scope.hold("rows", arrays.as_array(scope, given, node))
+    rows = scope.hold("rows", arrays.as_array(given, node))
     return f"{rows.text}.shape[0]", lambda index: arrays.row(rows.text, rows.type, index)
 
 
@@ -384,7 +384,7 @@ def _abs(scope: Scope, given: Expr, node: Any) -> Expr:
     if isinstance(given.type, t.Int):
         top = max(abs(given.type.low), abs(given.type.high))
         return Expr(f"python::absolute({given.text})", t.Int(0, min(top, t.HIGH)))
-    return arrays.calculate(scope, "absolute", [given], node)
+    return arrays.calculate("absolute", [given], node)
 
 
 def _round(scope: Scope, given: Expr, node: Any) -> Expr:

@@ -28,9 +28,9 @@ def call(scope: Scope, function: Any, name: str, node: Any) -> Expr:
         refuse(named or len(given) != function.nin, f"np.{name} with these arguments: {_listed(node)}", node)
         elementwise, tests, compared = t.data("numpy")["ufuncs"].values()
         if name in tests:
-            return _test(scope, name, given[0], node)
+            return _test(name, given[0], node)
         refuse(name not in elementwise + compared, f"np.{name}, whose last digits are others in C++", node)
-        return arrays.calculate(scope, name, given, node)
+        return arrays.calculate(name, given, node)
     return _function(scope, name, given, named, node)
 
 
@@ -53,7 +53,7 @@ def method(scope: Scope, owner: Expr, name: str, node: Any) -> Expr:
     given, named = arguments(scope, node)
     is_array = isinstance(owner.type, t.ArrayType)
     if name == "astype" and len(given) == 1 and not named:
-        return _cast(scope, owner, _dtype(given[0], node), node)
+        return _cast(owner, _dtype(given[0], node), node)
     if name == "item" and not given and not is_array:
         refuse(owner.type.dtype in ("uint64", "bool"), f"item() of {t.describe(owner.type)}", node)
         is_float = owner.type.dtype.startswith("float")
@@ -87,10 +87,10 @@ def _dtype(given: Expr | None, node: Any, default: str = "") -> str:
     return name
 
 
-def _cast(scope: Scope, given: Expr, dtype: str, node: Any) -> Expr:
+def _cast(given: Expr, dtype: str, node: Any) -> Expr:
     if not isinstance(given.type, t.ArrayType):
         return Expr(f"numpy::cast<{t.ELEMENTS[dtype]}>({given.text})", t.number(dtype))
-    array = arrays.as_array(scope, given, node)
+    array = arrays.as_array(given, node)
     kind = arrays.made(dtype, array.type.ndim, array.type.channels, [array])
     return Expr(f"numpy::astype<{t.ELEMENTS[dtype]}>({array.text})", kind)
 
@@ -100,11 +100,11 @@ def _converted(scope: Scope, dtype: str, node: Any) -> Expr:
     refuse(len(node.args) != 1 or node.keywords or dtype not in t.ELEMENTS, ast.unparse(node), node)
     given = value_of(scope, node.args[0])
     if isinstance(given.type, t.ArrayType) or given.type.dtype:
-        return _cast(scope, given, dtype, node)
+        return _cast(given, dtype, node)
     if given.parts is not None or isinstance(given.type, t.ListType):
         return _array(scope, {"object": given, "dtype": _written(dtype)}, node)
     refuse(not is_number(given.type) or ("float" not in dtype and given.type == t.FLOAT), ast.unparse(node), node)
-    return Expr(_number(scope, given, dtype, node), t.number(dtype))
+    return Expr(_number(given, dtype, node), t.number(dtype))
 
 
 def _written(dtype: str) -> Expr:
@@ -113,11 +113,11 @@ def _written(dtype: str) -> Expr:
     return Expr("", t.NONE, np.dtype(dtype))
 
 
-def _number(scope: Scope, given: Expr, dtype: str, node: Any) -> str:
+def _number(given: Expr, dtype: str, node: Any) -> str:
     """Return a number as an element; one of Python that does not fit raises."""
     element = t.ELEMENTS[dtype]
     if isinstance(given.type, t.Int) and "int" in dtype:
-        return arrays.as_element(scope, given, dtype, node)
+        return arrays.as_element(given, dtype, node)
     return (
         f"static_cast<{element}>({given.text})"
         if "float" in dtype or given.type.dtype
@@ -125,11 +125,11 @@ def _number(scope: Scope, given: Expr, dtype: str, node: Any) -> str:
     )
 
 
-def _test(scope: Scope, name: str, given: Expr, node: Any) -> Expr:
+def _test(name: str, given: Expr, node: Any) -> Expr:
     arrays.dtype_of(given, node)
     if not isinstance(given.type, t.ArrayType):
         return Expr(f"numpy::{name}({given.text})", t.number("bool"))
-    array = arrays.as_array(scope, given, node)
+    array = arrays.as_array(given, node)
     return Expr(f"numpy::{name}({array.text})", arrays.joint_type("bool", [array]))
 
 
@@ -143,7 +143,7 @@ def _axis(given: Expr | None, ndim: int, node: Any) -> int | None:
 def _reduced(scope: Scope, bound: Bound, node: Any, name: str) -> Expr:
     import numpy as np
 
-    array = arrays.as_array(scope, bound["a"], node)
+    array = arrays.as_array(bound["a"], node)
     kind, text = array.type, array.text
     axis = _axis(bound.get("axis"), kind.ndim, node)
     is_sum, is_float = name in ("sum", "mean", "std", "var"), kind.dtype.startswith("float")
@@ -188,7 +188,7 @@ def _channels(parts: Sequence[Expr]) -> int:
 def _full(scope: Scope, bound: Bound, node: Any, value: str = "") -> Expr:
     fill, like = bound.get("fill_value"), []
     if "a" in bound:
-        array = arrays.as_array(scope, bound["a"], node)
+        array = arrays.as_array(bound["a"], node)
         ndim, channels, shape = array.type.ndim, array.type.channels, f"{array.text}.shape"
         dtype, like = _dtype(bound.get("dtype"), node, array.type.dtype), [array]
     else:
@@ -198,7 +198,7 @@ def _full(scope: Scope, bound: Bound, node: Any, value: str = "") -> Expr:
     if fill is not None:
         is_float = fill.type == t.FLOAT and "float" not in dtype
         refuse(not is_number(fill.type) or is_float, f"{t.describe(fill.type)} in an array of {dtype}", node)
-    text = f"static_cast<{t.ELEMENTS[dtype]}>({value})" if fill is None else _number(scope, fill, dtype, node)
+    text = f"static_cast<{t.ELEMENTS[dtype]}>({value})" if fill is None else _number(fill, dtype, node)
     kind = arrays.made(dtype, ndim, channels, like)
     return Expr(f"numpy::full<{t.ELEMENTS[dtype]}, {ndim}>({shape}, {text})", kind)
 
@@ -208,9 +208,9 @@ def _array(scope: Scope, bound: Bound, node: Any) -> Expr:
 
     given, wanted = bound["object"], _dtype(bound["dtype"], node) if "dtype" in bound else ""
     if isinstance(given.type, t.ArrayType):
-        return _cast(scope, given, wanted or given.type.dtype, node)
+        return _cast(given, wanted or given.type.dtype, node)
     if isinstance(given.type, t.ListType) and not given.parts:
-        return _of_list(scope, given, wanted, node)
+        return _of_list(given, wanted, node)
     shape, flat = _nested(given, node)
     refuse(
         not flat or not all(is_number(item.type) for item in flat), "an array of what is not written as numbers", node
@@ -219,7 +219,7 @@ def _array(scope: Scope, bound: Bound, node: Any) -> Expr:
     refuse(dtype not in t.ELEMENTS, f"an array of {dtype}", node)
     is_cast = any(item.type.dtype and not np.can_cast(item.type.dtype, dtype, "same_kind") for item in flat)
     refuse(is_cast, f"numbers of NumPy in an array of {dtype}", node)
-    numbers = ", ".join(_number(scope, item, dtype, node) for item in flat)
+    numbers = ", ".join(_number(item, dtype, node) for item in flat)
     text = f"numpy::array<{t.ELEMENTS[dtype]}, {len(shape)}>({{{', '.join(map(str, shape))}}}, {{{numbers}}})"
     return Expr(text, arrays.made(dtype, len(shape), shape[2] if len(shape) == 3 else 0))
 
@@ -233,7 +233,7 @@ def _nested(given: Expr, node: Any) -> tuple[tuple[int, ...], list[Expr]]:
     return (len(inner), *inner[0][0]), [number for _, numbers in inner for number in numbers]
 
 
-def _of_list(scope: Scope, given: Expr, wanted: str, node: Any) -> Expr:
+def _of_list(given: Expr, wanted: str, node: Any) -> Expr:
     item = given.type.item
     if is_number(item):
         own = arrays.own_dtype(item)
@@ -249,7 +249,7 @@ def _of_list(scope: Scope, given: Expr, wanted: str, node: Any) -> Expr:
 
 
 def _reshape(scope: Scope, bound: Bound, node: Any) -> Expr:
-    array, parts = arrays.as_array(scope, bound["a"], node), _shape(bound["shape"], node)
+    array, parts = arrays.as_array(bound["a"], node), _shape(bound["shape"], node)
     text = f"{array.text[:-1]}, true)" if array.text.startswith("numpy::from_rows<") else array.text
     # It may be a view or a copy: nothing writes to it.
     shares(scope, array, node)
@@ -258,14 +258,14 @@ def _reshape(scope: Scope, bound: Bound, node: Any) -> Expr:
 
 
 def _ravel(scope: Scope, bound: Bound, node: Any) -> Expr:
-    array = arrays.as_array(scope, bound["a"], node)
+    array = arrays.as_array(bound["a"], node)
     shares(scope, array, node)
     return Expr(f"numpy::ravel({array.text})", replace(array.type, ndim=1, channels=0, is_readonly=True))
 
 
 def _clip(scope: Scope, bound: Bound, node: Any) -> Expr:
     refuse(len(bound) < 3 or any(each.value is None for each in bound.values()), "np.clip with one bound", node)
-    return arrays.calculate(scope, "clip", [bound["a"], bound["a_min"], bound["a_max"]], node)
+    return arrays.calculate("clip", [bound["a"], bound["a_min"], bound["a_max"]], node)
 
 
 def _where(scope: Scope, bound: Bound, node: Any) -> Expr:
@@ -276,15 +276,15 @@ def _where(scope: Scope, bound: Bound, node: Any) -> Expr:
     kinds = [arrays.dtype_of(bound[name], node) for name in ("x", "y")]
     dtype = np.result_type(*(kind(0) if kind is int or kind is float else kind for kind in kinds)).name
     refuse(dtype not in t.ELEMENTS, f"np.where makes {dtype}", node)
-    operands = [arrays.operand(scope, bound["condition"], "bool", node, is_compared=True)]
-    operands += [arrays.operand(scope, bound[name], dtype, node) for name in ("x", "y")]
+    operands = [arrays.operand(bound["condition"], "bool", node, is_compared=True)]
+    operands += [arrays.operand(bound[name], dtype, node) for name in ("x", "y")]
     kind = arrays.joint_type(dtype, operands)
     refuse(not isinstance(kind, t.ArrayType), "np.where of numbers alone", node)
     return Expr(f"numpy::where<{t.ELEMENTS[dtype]}>({', '.join(each.text for each in operands)})", kind)
 
 
 def _nonzero(scope: Scope, bound: Bound, node: Any) -> Expr:
-    array = scope.hold("mask", arrays.as_array(scope, bound["a"], node))
+    array = scope.hold("mask", arrays.as_array(bound["a"], node))
     # NumPy's are the columns of one array.
     kind = t.ArrayType("int64", 1, is_mat=False, is_other=True)
     return tuple_of([Expr(f"numpy::nonzero<{axis}>({array.text})", kind) for axis in range(array.type.ndim)])
@@ -301,7 +301,7 @@ def _arange(scope: Scope, bound: Bound, node: Any) -> Expr:
 
 def _joined(scope: Scope, bound: Bound, node: Any, axis: int | None = None, is_stack: bool = False) -> Expr:
     """Join arrays along an axis, or in a new one."""
-    parts = [arrays.as_array(scope, part, node) for part in bound["arrays"].parts or ()]
+    parts = [arrays.as_array(part, node) for part in bound["arrays"].parts or ()]
     kinds = {(part.type.dtype, part.type.ndim) for part in parts}
     refuse(len(kinds) != 1, "arrays that are not written out, or of different dtypes or dimensions, are joined", node)
     dtype, ndim = kinds.pop()
@@ -317,12 +317,12 @@ def _joined(scope: Scope, bound: Bound, node: Any, axis: int | None = None, is_s
 
 
 def _sort(scope: Scope, bound: Bound, node: Any) -> Expr:
-    array = arrays.as_array(scope, bound["a"], node)
+    array = arrays.as_array(bound["a"], node)
     return Expr(f"numpy::sort({array.text})", arrays.joint_type(array.type.dtype, [array]))
 
 
 def _argsort(scope: Scope, bound: Bound, node: Any) -> Expr:
-    array, kind = arrays.as_array(scope, bound["a"], node), bound.get("kind")
+    array, kind = arrays.as_array(bound["a"], node), bound.get("kind")
     is_stable = kind is not None and kind.value == "stable"
     refuse(not is_stable, 'np.argsort without kind="stable", whose order of equal elements is not defined', node)
     refuse(array.type.ndim != 1, "np.argsort of several dimensions", node)
@@ -331,22 +331,22 @@ def _argsort(scope: Scope, bound: Bound, node: Any) -> Expr:
 
 def _average(scope: Scope, bound: Bound, node: Any) -> Expr:
     refuse("weights" not in bound, "np.average without weights", node)
-    array, weights = (arrays.as_array(scope, bound[name], node) for name in ("a", "weights"))
+    array, weights = (arrays.as_array(bound[name], node) for name in ("a", "weights"))
     kinds = {(each.type.dtype, each.type.ndim) for each in (array, weights)}
     refuse(kinds != {("float64", array.type.ndim)}, "np.average of other arrays than float64", node)
-    total = _reduced(scope, {"a": arrays.calculate(scope, "multiply", [array, weights], node)}, node, "sum")
+    total = _reduced(scope, {"a": arrays.calculate("multiply", [array, weights], node)}, node, "sum")
     return Expr(f"numpy::weighted({total.text}, {_reduced(scope, {'a': weights}, node, 'sum').text})", total.type)
 
 
 def _copy(scope: Scope, bound: Bound, node: Any) -> Expr:
     if isinstance(bound["a"].type, t.ArrayType) and bound["a"].type.is_mat:
         return Expr(f"{bound['a'].atom}.clone()", replace(bound["a"].type, is_readonly=False))
-    return _cast(scope, bound["a"], bound["a"].type.dtype, node)
+    return _cast(bound["a"], bound["a"].type.dtype, node)
 
 
 def _rounded(scope: Scope, bound: Bound, node: Any) -> Expr:
     is_integer = "int" in bound["a"].type.dtype
-    return _copy(scope, bound, node) if is_integer else arrays.calculate(scope, "rint", [bound["a"]], node)
+    return _copy(scope, bound, node) if is_integer else arrays.calculate("rint", [bound["a"]], node)
 
 
 def _same(scope: Scope, bound: Bound, node: Any) -> Expr:
@@ -355,7 +355,7 @@ def _same(scope: Scope, bound: Bound, node: Any) -> Expr:
     kind = given.type
     if not isinstance(kind, t.ArrayType) or _dtype(bound.get("dtype"), node, kind.dtype) != kind.dtype:
         return _array(scope, bound, node)
-    array = arrays.as_array(scope, given, node)
+    array = arrays.as_array(given, node)
     if ast.unparse(node.func).endswith("asarray"):
         return given
     shares(scope, array, node)
@@ -363,7 +363,7 @@ def _same(scope: Scope, bound: Bound, node: Any) -> Expr:
 
 
 def _transposed(scope: Scope, bound: Bound, node: Any) -> Expr:
-    return arrays.attribute(scope, bound["a"], "T", node)
+    return arrays.attribute(bound["a"], "T", node)
 
 
 _BUILDERS: Final[Mapping[str, Callable[..., Expr]]] = {

@@ -312,7 +312,7 @@ def converted(scope: Scope, given: Expr, kind: str, node: Any, *, is_optional: b
     elif kind in ("int", "bool") and (isinstance(own, t.Int) or own == t.BOOL or (is_numpy and "int" in own.dtype)):
         if kind == "bool":
             return given.text if own == t.BOOL else f"{given.atom} != 0"
-        return f"static_cast<int>({given.text})" if own == t.BOOL else narrow(scope, given)
+        return f"static_cast<int>({given.text})" if own == t.BOOL else narrow(given)
     elif kind == "String" and own == t.TEXT:
         return given.text
     elif kind in tuples():
@@ -323,13 +323,13 @@ def converted(scope: Scope, given: Expr, kind: str, node: Any, *, is_optional: b
             parts = [converted(scope, part, item, node) for part in given.parts]
             return f"std::vector<{item}>{{{', '.join(parts)}}}"
     elif kind.rpartition("::")[2][:1].isupper() and "<" not in kind and isinstance(own, t.Int):
-        return f"static_cast<cv::{kind}>({narrow(scope, given)})"
+        return f"static_cast<cv::{kind}>({narrow(given)})"
     elif isinstance(own, t.ListType | t.RecordType) and own.cpp.replace("cv::", "").replace("std::", "") == kind:
         return given.text
     raise ByHand(f"OpenCV takes {kind} where {t.describe(own)} is given", node)
 
 
-def narrow(scope: Scope, given: Expr) -> str:
+def narrow(given: Expr) -> str:
     """Return an integer as an int; one that does not fit is an error at run time, as in Python."""
     own = given.type
     if isinstance(own, t.Int) and own.is_within(31):

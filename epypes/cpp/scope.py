@@ -288,7 +288,7 @@ class Scope:
         if name in self.refined and isinstance(kind, t.ArrayType) and kind.is_mat:
             from epypes.cpp.arrays import as_array
 
-            value = as_array(self, value, node)
+            value = as_array(value, node)
             kind = value.type
         variable = self.variables.get((name, kind.cpp))
         if variable is None:

@@ -50,7 +50,6 @@ def function(
     given: Mapping[str, t.Type],
     functions: Callable[[Any, Sequence[t.Type], ast.AST], tuple[str, t.Type]],
     wanted: t.Type | None = None,
-    cpp_names: Sequence[str] = (),
 ) -> Translated:
     """Translate a function for the types of its arguments.
 
@@ -349,7 +348,7 @@ def _augmented(scope: Scope, node: Any, returned: t.Type | None) -> None:
             arrays.augmented(scope, left, node.op, right, node)
             return
         refuse(isinstance(left.type, t.ListType), "a list is extended by an operator", node)
-        scope.assign(name, binary(scope, node.op, left, right, node), node)
+        scope.assign(name, binary(node.op, left, right, node), node)
         return
     if isinstance(node.target, ast.Subscript):
         owner = value_of(scope, node.target.value)
@@ -371,7 +370,7 @@ def fitted(scope: Scope, value: Expr, wanted: t.Type, node: Any) -> str:
     """Return a value as the type that a function has to return."""
     own = value.type
     if isinstance(wanted, t.ArrayType) and isinstance(own, t.ArrayType):
-        return arrays.fitted(scope, value, wanted, node)
+        return arrays.fitted(value, wanted, node)
     if value.value is None and (wanted == t.NONE or isinstance(wanted, t.OptionalType)):
         return "std::nullopt"
     if value.value is None and isinstance(wanted, t.ArrayType) and wanted.is_mat:
@@ -387,7 +386,7 @@ def fitted(scope: Scope, value: Expr, wanted: t.Type, node: Any) -> str:
         texts = [fitted(scope, part, wanted.item, node) for part in value.parts]
         return f"{wanted.cpp}{{{', '.join(texts)}}}"
     if isinstance(wanted, t.Int) and isinstance(own, t.Int):
-        return opencv.narrow(scope, value) if wanted.is_int else value.text
+        return opencv.narrow(value) if wanted.is_int else value.text
     if wanted == t.MIXED and (own == t.FLOAT or own.dtype == "float64"):
         return value.text
     if wanted == t.MIXED and isinstance(own, t.Int) and own.is_within(53):
