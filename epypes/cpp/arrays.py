@@ -30,7 +30,8 @@ def as_array(given: Expr, node: Any) -> Expr:
 def made(dtype: str, ndim: int, channels: int = 0, operands: Sequence[Expr] = ()) -> t.Type:
     """Return the type of a new array; of no dimensions, of a number."""
     kinds = [each.type for each in operands if isinstance(each.type, t.ArrayType)]
-    is_other = any(kind.is_strided or kind.is_other for kind in kinds)
+    # What has one dimension has one order.
+    is_other = ndim > 1 and any(kind.is_strided or kind.is_other for kind in kinds)
     return t.ArrayType(dtype, ndim, channels, is_mat=False, is_other=is_other) if ndim else t.number(dtype)
 
 
