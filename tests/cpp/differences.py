@@ -908,8 +908,8 @@ def none_of_opencv(image):
     found, _ = cv2.findHomography(one, one)
     part, lines = cv2.intersectConvexConvex(one[:3], one[:3] + 5)[1], cv2.HoughLines(image * 0, 1, 0.1, 99)
     kept = lines if lines is not None else cv2.HoughLines(image * 0 + 255, 1, 0.1, 2)
-    made = hierarchy is None, found is None, 1 if part is None else 2, lines is None, kept is None
-    return *made, image is None, cv2.blur(image, (3, 3)) is not None, float(kept[0, 0, 1])
+    made = hierarchy is None and found is None and lines is None and kept is not None
+    return made, 1 if part is None else 2, image is None, cv2.blur(image, (3, 3)) is not None, float(kept[0, 0, 1])
 
 
 def masked_rows(colour, image):
