@@ -85,9 +85,12 @@ def function(
             raise
         refuse(not scope.is_dead, "it may end without a return", node)
         for dtype, place in scope.unsure.items():
-            # Who calls another function of the user may write to what that one returns.
+            # What a function returns to another one of the user, that one may write to.
             is_written = wanted is None or scope.written & {dtype, ""}
-            refuse(is_written, f"NumPy may make a view where C++ makes a copy, and writes to {dtype}", place)
+            reason = (
+                f"it may be a view in NumPy and a copy in C++, and arrays of {dtype or 'this dtype'} are written to"
+            )
+            refuse(is_written, reason, place)
         if wanted is None:
             kind = scope.returns[0] if scope.returns else t.NONE
             for other in scope.returns[1:]:

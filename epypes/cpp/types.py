@@ -333,7 +333,7 @@ def readonly(kind: Type) -> Type:
     """Return the type of a value whose arrays nothing may write to."""
     if isinstance(kind, ArrayType):
         return replace(kind, is_readonly=True)
-    if isinstance(kind, ListType):
+    if isinstance(kind, ListType | OptionalType):
         return replace(kind, item=readonly(kind.item))
     return TupleType(tuple(map(readonly, kind.items))) if isinstance(kind, TupleType) else kind
 

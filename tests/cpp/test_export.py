@@ -136,6 +136,20 @@ def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
     assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
 
 
+def test_a_state_that_begins_with_an_array_brings_the_header_of_arrays(tmp_path):
+    def mixed(image, before):
+        return cv2.addWeighted(image, 0.5, before, 0.5, 0)
+
+    cg = ep.delay(ep.CompGraph.from_functions(mixed), "mixed", "before", initial=np.zeros((2, 3), np.uint8))
+    runner = ep.CompGraphRunner(cg)
+    runner.run(image=np.full((2, 3), 8, np.uint8))
+    project = ep.export_cpp(runner, tmp_path / "cpp").path
+    text = (project / "graph.hpp").read_text()
+    assert "cv::Mat before = numpy::mat(numpy::array<std::uint8_t, 2>({2, 3}, {0, 0, 0, 0, 0, 0}));" in text
+    assert '#include "array.hpp"' in text
+    assert (project / "array.hpp").is_file()
+
+
 def test_a_token_that_messages_have_no_form_for_has_no_service(tmp_path):
     def corner(image):
         return cv2.KeyPoint(float(image[0, 0]), 2.0, 3.0)
