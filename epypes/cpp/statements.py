@@ -85,12 +85,9 @@ def function(
             raise
         refuse(not scope.is_dead, "it may end without a return", node)
         for dtype, place in scope.unsure.items():
-            # What a function returns to another one of the user, that one may write to.
+            # The caller of a function of the user may write to what that returns.
             is_written = wanted is None or scope.written & {dtype, ""}
-            reason = (
-                f"it may be a view in NumPy and a copy in C++, and arrays of {dtype or 'this dtype'} are written to"
-            )
-            refuse(is_written, reason, place)
+            refuse(is_written, f"it may be a view in NumPy and a copy in C++, and {dtype} is written to", place)
         if wanted is None:
             kind = scope.returns[0] if scope.returns else t.NONE
             for other in scope.returns[1:]:
