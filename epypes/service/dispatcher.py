@@ -119,8 +119,8 @@ class Dispatcher:
         self.answered_in_row = 0
         self._policy, self._size, self._slots = options.mailbox_policy, options.capacity, options.threads
         self._max_deaths = options.retries
-        # A broker keeps events while there is no room, and confirms their answers: they are in flight until then.
-        self._has_broker, self._is_confirmed = options.has_broker, options.is_confirmed
+        # A broker keeps events while there is no room.
+        self._has_broker = options.has_broker
         self._results, self._provenance = results, provenance
         self._connection: WorkerConnection | None = None
         self._holds: set[str] = set()
@@ -333,11 +333,8 @@ class Dispatcher:
             self._release(eldest, eldest.result)
 
     def _release(self, event: AcceptedEvent, result: Result) -> None:
-        """Have a result published and counted; if a broker confirms it, it is in flight until then."""
-        if self._is_confirmed:
-            self._unconfirmed[event.seq] = event
-        else:
-            self._totals[result.outcome] += 1
+        """Have a result published; the event is in flight until its answer is confirmed."""
+        self._unconfirmed[event.seq] = event
         self._to_publish.append(partial(self._results.publish, event, result, self._settled))
 
     def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
@@ -475,17 +472,10 @@ class Dispatcher:
                     self._publishing_thread = 0
 
     def _settled(self, event: AcceptedEvent, result: Result, error: Exception | None) -> None:
-        """Note that an answer is confirmed; without that, the broker that keeps the event delivers it again."""
+        """Count an event whose answer is confirmed; without that, the broker that keeps the event delivers it again."""
         is_returned = error is not None and self._has_broker
         if error is not None and not is_returned:
             result = self._results.report_lost(event, result, error)
-        if not self._is_confirmed:
-            if event.result is not None and event.result.outcome != result.outcome:
-                # It was counted when it was released; a failure has replaced the answer, which can't be published.
-                with self.lock:
-                    self._totals[event.result.outcome] -= 1
-                    self._totals[result.outcome] += 1
-            return
         if event.seq not in self._unconfirmed:
             # It was given back meanwhile, or dropped.
             return

@@ -1,6 +1,7 @@
 """Results of events: how they are published, and reported to the failure store, the event log and listeners.
 
-The sender gets the answer first. When the answer is confirmed, the result is counted, logged and kept.
+The sender gets the answer first. When the answer is confirmed, the result is logged, kept and counted: a ZeroMQ socket,
+DDS and Zenoh confirm what they have taken.
 """
 
 from __future__ import annotations
@@ -383,9 +384,11 @@ class ResultPublisher:
                 self.publish(event, refusal, on_settled)
                 return
             error = None
-        if error is None:
-            self._report(event, result)
-        on_settled(event, result, error)
+        try:
+            if error is None:
+                self._report(event, result)
+        finally:
+            on_settled(event, result, error)
 
     def report_lost(self, event: AcceptedEvent, result: Result, error: Exception) -> Result:
         """Report an event whose answer was lost and that no broker keeps; return its result."""
