@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any, Final
 
 from epypes.acquisition.camera_settings import CameraSetting
-from epypes.acquisition.device import FoundCamera, Grabbed, held
+from epypes.acquisition.device import FoundCamera, Grabbed
 from epypes.acquisition.pixel_formats import to_image
 from epypes.errors import CameraUnavailable, InvalidValue, UnknownName
 from epypes.optional import optional_import
@@ -55,8 +55,6 @@ class Backend:
         with _lock:
             try:
                 camera = _made[name] if name in _made else pylon.InstantCamera(self._factory.CreateDevice(info))
-                if camera.IsOpen():
-                    raise held(found.address)
                 camera.Open()
                 _made[name] = camera
                 return BaslerDevice(camera, found.address)
