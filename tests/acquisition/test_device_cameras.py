@@ -96,8 +96,10 @@ def test_what_a_setting_can_not_be_is_refused_with_its_range(camera):
         camera.settings["PixelFormat"] = "Mono9"
     with pytest.raises(KeyError, match=r"No setting 'Widht' of this camera\. Did you mean 'Width'\?"):
         camera.settings["Widht"] = 3
-    with pytest.raises(KeyError, match=r"No command 'Trigger' of this camera"):
-        camera.settings.execute("Trigger")
+    with pytest.raises(KeyError, match=r"No command 'Width' of this camera\. There are: .*TriggerSoftware"):
+        camera.settings.execute("Width")
+    with pytest.raises(KeyError, match=r"No command 'TriggerSoft' of this camera\. Did you mean 'TriggerSoftware'"):
+        camera.settings.execute("TriggerSoft")
     assert camera.read().shape == (64, 96)
 
 
