@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from weakref import WeakValueDictionary
 
 from epypes.acquisition.frames import Frame, frames_read
@@ -26,10 +26,6 @@ class DeviceOwner:
         self._cell, self._made_at = _cell_and_place()
         self._loops = 0
         self._last_reader: threading.Thread | None = None
-
-    def read(self) -> Any:
-        """Return the next frame."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Let go of the device."""

@@ -122,6 +122,7 @@ class Dispatcher:
         # A broker keeps events while there is no room.
         self._has_broker = options.has_broker
         self._results, self._provenance = results, provenance
+        results.on_settled = self._settled
         self._connection: WorkerConnection | None = None
         self._holds: set[str] = set()
         self._why_refused, self._waiting_threads = "", 0
@@ -191,7 +192,7 @@ class Dispatcher:
         """Drop an event, which is published at once and not in the order of acceptance."""
         self._totals["dropped"] += 1
         event.result = dropped_result(event, reason, self._provenance())
-        self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
+        self._to_publish.append(partial(self._results.publish, event, event.result))
 
     def _has_room(self) -> bool:
         """Whether an event that comes now is neither dropped nor has another one dropped."""
@@ -335,7 +336,7 @@ class Dispatcher:
     def _release(self, event: AcceptedEvent, result: Result) -> None:
         """Have a result published; the event is in flight until its answer is confirmed."""
         self._unconfirmed[event.seq] = event
-        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
+        self._to_publish.append(partial(self._results.publish, event, result))
 
     def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
         """Note that the worker died by itself, or of one of its events; they are tried again, or are dead letters."""

@@ -84,10 +84,8 @@ class ZenohSession(PeerSession):
             raise AddressError(str(address), text)
         _check_process(address)
         if not _has_router(address):
-            # Tried before the session connects to it.
-            held = _open_meeting_point(address)
-            self._keeper = threading.Thread(target=self._keep_meeting_point, args=[held], daemon=True)
-            self._keeper.name = f"epypes peer {address.name}"
+            name = f"epypes peer {address.name}"
+            self._keeper = threading.Thread(target=self._keep_meeting_point, name=name, daemon=True)
             self._keeper.start()
         try:
             session = self._session = zenoh.open(_config(address, self.options))
@@ -124,16 +122,17 @@ class ZenohSession(PeerSession):
             self._declared.append(session.liveliness().declare_token(token))
         self._declared.append(self._publisher)
 
-    def _keep_meeting_point(self, held: Any) -> None:
+    def _keep_meeting_point(self) -> None:
         """Listen where the peers of this machine meet, as soon as no other session does.
 
         Zenoh could try again by itself, but waits for that without end when the session closes.
         """
-        while held is None and not self._closing.wait(_TAKES_PORT_S):
-            held = _open_meeting_point(self.address)
-        self._closing.wait()
-        if held is not None:
-            held.close()
+        endpoints = [_endpoint(self.address, _MEETING_PORT)]
+        listen = {"endpoints": endpoints, "timeout_ms": 0, "exit_on_failure": True}
+        while not self._closing.is_set():
+            with contextlib.suppress(zenoh.ZError), zenoh.open(_made({"mode": "peer", "listen": listen})):
+                self._closing.wait()
+            self._closing.wait(_TAKES_PORT_S)
 
     def send(self, frames: Frames, id: str, headers: Mapping[str, str]) -> None:  # noqa: A002
         """Put a message; see `PeerSession.send`."""
@@ -290,15 +289,6 @@ def _config(address: Address, options: ChannelOptions) -> zenoh.Config:
     if address.ca:
         settings["transport/link/tls/root_ca_certificate"] = address.ca
     return _made(settings)
-
-
-def _open_meeting_point(address: Address) -> Any:
-    """Return a session that listens where the peers of this machine meet; None if another one does."""
-    listen = {"endpoints": [_endpoint(address, _MEETING_PORT)], "timeout_ms": 0, "exit_on_failure": True}
-    try:
-        return zenoh.open(_made({"mode": "peer", "listen": listen}))
-    except zenoh.ZError:
-        return None
 
 
 def _made(settings: Mapping[str, Any]) -> zenoh.Config:
