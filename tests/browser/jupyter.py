@@ -341,6 +341,18 @@ def write_notebook(path: Path, *cells: str) -> None:
     nbformat.write(nbformat.v4.new_notebook(cells=code, metadata=metadata), path)
 
 
+@contextmanager
+def running_notebook(page: Any, path: Path, *cells: str, width: int = 1280, height: int = 900) -> Iterator[Notebook]:
+    """Write a notebook with these cells of code, open it in a page of `open_lab` and run it; close it at the end."""
+    write_notebook(path, *(cell.strip() for cell in cells))
+    notebook = Notebook(page, path.name, width, height)
+    try:
+        notebook.run_all()
+        yield notebook
+    finally:
+        notebook.close()
+
+
 def open_page(browser: Any, **options: Any) -> Any:
     """Open a page in a context of its own, with the time-out of all waits and no transitions of colours.
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 from tests.fake_camera import FakeCamera
 
@@ -51,11 +51,8 @@ def fake() -> Iterator[FakeCamera]:
 
 @pytest.fixture(scope="module")
 def notebook(lab_page: Any, lab: JupyterLab, fake: FakeCamera) -> Iterator[Notebook]:
-    write_notebook(lab.root / "camera.ipynb", SET_UP.strip(), SHOW.strip())
-    notebook = Notebook(lab_page, "camera.ipynb", height=1300)
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "camera.ipynb", SET_UP, SHOW, height=1300) as notebook:
+        yield notebook
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
@@ -48,11 +48,8 @@ TEXT = "() => document.querySelector('.epypes-frame-text').textContent"
 
 @pytest.fixture(scope="module")
 def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    write_notebook(lab.root / "states.ipynb", SET_UP.strip(), SHOW.strip())
-    notebook = Notebook(lab_page, "states.ipynb", height=1100)
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "states.ipynb", SET_UP, SHOW, height=1100) as notebook:
+        yield notebook
 
 
 @pytest.fixture

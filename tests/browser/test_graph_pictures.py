@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 
 pytestmark = pytest.mark.browser
 
@@ -58,11 +58,10 @@ class Graph:
 @pytest.fixture
 def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
     """A notebook with the graph of a run of 1 MP, and cells after it."""
-    write_notebook(lab.root / "graph.ipynb", SET_UP, "display(runner.run(image=photograph))", "1 + 1", "2 + 2")
-    notebook = Notebook(lab_page, "graph.ipynb")
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(
+        lab_page, lab.root / "graph.ipynb", SET_UP, "display(runner.run(image=photograph))", "1 + 1", "2 + 2"
+    ) as notebook:
+        yield notebook
     assert not notebook.page_errors
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
@@ -43,11 +43,8 @@ BROKEN = """() => [...document.querySelectorAll('.jupyter-widgets-disconnected')
 
 @pytest.fixture
 def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    write_notebook(lab.root / "ended.ipynb", GRAPH.strip(), SHOW.strip())
-    notebook = Notebook(lab_page, "ended.ipynb", 1440, 900)
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "ended.ipynb", GRAPH, SHOW, width=1440, height=900) as notebook:
+        yield notebook
 
 
 def check_ended(panel: PanelOnScreen, text: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.browser.conftest import SCREENSHOTS
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
@@ -56,11 +56,8 @@ def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
         "ep.show(run, depth=1)",
         'panel = tune(runner, token="shape")\npanel',
     )
-    write_notebook(lab.root / "nested.ipynb", *(cell.strip() for cell in cells))
-    notebook = Notebook(lab_page, "nested.ipynb", width=1440)
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "nested.ipynb", *cells, width=1440) as notebook:
+        yield notebook
 
 
 def test_a_click_opens_what_is_inside_a_pipeline(notebook: Notebook) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 
 pytestmark = pytest.mark.browser
 
@@ -48,12 +48,9 @@ None""",
 
 @pytest.fixture(scope="module")
 def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    write_notebook(lab.root / "pick.ipynb", *_CELLS)
-    notebook = Notebook(lab_page, "pick.ipynb", height=1800)
-    notebook.run_all()
-    notebook.page.wait_for_selector(".epypes-picker-tile img")
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "pick.ipynb", *_CELLS, height=1800) as notebook:
+        notebook.page.wait_for_selector(".epypes-picker-tile img")
+        yield notebook
 
 
 def hyperparameters(notebook: Notebook) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import pytest
 import epypes as ep
 from epypes.bundle.adapters import REQUEST
 from epypes.wire import Envelope
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 from tests.service.processes import running
 from tests.service.states import read_state
@@ -116,12 +116,9 @@ def open_notebook(lab_page: Any, lab: JupyterLab, state: Any, line: Line) -> Ite
         "panel = tune(service)\npanel",
         "service",
     )
-    write_notebook(lab.root / "remote.ipynb", *cells)
-    notebook = Notebook(lab_page, "remote.ipynb")
-    notebook.run_all()
-    yield notebook
-    notebook.execute("panel.close(); service.close()")
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "remote.ipynb", *cells) as notebook:
+        yield notebook
+        notebook.execute("panel.close(); service.close()")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
@@ -38,11 +38,8 @@ panel
 
 @pytest.fixture(scope="module")
 def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    write_notebook(lab.root / "rows.ipynb", SET_UP.strip(), SHOW.strip())
-    notebook = Notebook(lab_page, "rows.ipynb", 1440, 900)
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "rows.ipynb", SET_UP, SHOW, width=1440, height=900) as notebook:
+        yield notebook
 
 
 @pytest.fixture

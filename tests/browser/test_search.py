@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
@@ -30,11 +30,8 @@ _STATE = "state => document.querySelector('.epypes-search').dataset.state === st
 
 @pytest.fixture(scope="module")
 def searched(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    write_notebook(lab.root / "search.ipynb", *_CELLS)
-    notebook = Notebook(lab_page, "search.ipynb")
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "search.ipynb", *_CELLS) as notebook:
+        yield notebook
 
 
 def test_a_search_is_followed_and_its_best_is_used_and_undone(searched: Notebook) -> None:

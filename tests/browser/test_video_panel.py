@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
+from tests.browser.jupyter import JupyterLab, Notebook, running_notebook
 from tests.browser.panel import PanelOnScreen
 from tests.videos import write_video
 
@@ -44,11 +44,8 @@ TEXT = "() => document.querySelector('.epypes-frame-text').textContent"
 def notebook(lab_page: Any, lab: JupyterLab, request: pytest.FixtureRequest) -> Iterator[Notebook]:
     write_video(lab.root / "belt.mp4", 100)
     root = f"ROOT = {str(request.config.rootpath)!r}"
-    write_notebook(lab.root / "video.ipynb", f"{root}\n{READ.strip()}", SET_UP.strip(), SHOW.strip())
-    notebook = Notebook(lab_page, "video.ipynb", height=1100)
-    notebook.run_all()
-    yield notebook
-    notebook.close()
+    with running_notebook(lab_page, lab.root / "video.ipynb", f"{root}\n{READ}", SET_UP, SHOW, height=1100) as notebook:
+        yield notebook
 
 
 @pytest.fixture
