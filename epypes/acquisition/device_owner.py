@@ -16,6 +16,7 @@ from weakref import WeakValueDictionary
 from epypes.acquisition.frames import Frame, frames_read
 from epypes.errors import CameraUnavailable
 
+_OWN: Final = ("epypes", "epypes_widgets")
 _lock: Final = threading.Lock()
 
 
@@ -64,8 +65,9 @@ class DeviceOwner:
 
     def _disown(self) -> None:
         """Let other cameras have what this one has."""
-        for device in [device for device, owner in list(_owners.items()) if owner is self]:
-            del _owners[device]
+        with _lock:
+            for device in [device for device, owner in _owners.items() if owner is self]:
+                del _owners[device]
 
     @property
     def _is_read(self) -> bool:
@@ -83,7 +85,7 @@ def _cell_and_place() -> tuple[int, str]:
     ipython = sys.modules.get("IPython")
     shell = None if ipython is None else ipython.get_ipython()
     frame = sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("epypes"):
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _OWN:
         frame = frame.f_back
     path = frame.f_code.co_filename
     name = None if shell is None else shell.compile.format_code_name(path)
