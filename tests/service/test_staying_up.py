@@ -369,7 +369,7 @@ def test_a_good_bundle_takes_over_under_load_and_can_be_rolled_back(acting, bett
         by_revision = {0: 2, 1: 100, 2: 2}
         assert all(answer.parts["out"] == by_revision[answer.revision] for answer in answers)
         assert {answer.bundle_digest for answer in answers if answer.revision != 1} == {first}
-        assert service.counts()["answered"] == len(sent)
+        until(lambda: service.counts()["answered"] == len(sent))
 
 
 def test_a_bundle_that_is_not_good_leaves_the_other_one_serving(acting, tmp_path):
