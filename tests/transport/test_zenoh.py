@@ -135,6 +135,7 @@ def session():
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
     config.insert_json5("connect/endpoints", '["tcp/127.0.0.1:7446"]')
+    config.insert_json5("connect/retry", '{"period_init_ms": 100}')
     with zenoh.open(config) as opened:
         yield opened
 
