@@ -11,7 +11,9 @@ from epypes.bundle import verify
 from epypes.errors import PromotionRefused
 from tests.bundle.cells import cell
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fresh_interpreter")]
+pytestmark = pytest.mark.slow
+# What an interpreter takes from its environment when it starts.
+fresh = pytest.mark.usefixtures("fresh_interpreter")
 
 X = np.random.default_rng(5).random(10_000, dtype=np.float32)
 # By what it depends on: a cell that defines `use`, and what the reason names.
@@ -101,6 +103,7 @@ def refusal(source, to):
     return "\n".join(reasons_against([source], to))
 
 
+@fresh
 def test_what_depends_on_a_condition_is_refused_with_token_and_condition(tmp_path):
     reasons = reasons_against([source for source, _ in DEPENDS.values()], tmp_path / "bundle")
     assert len(reasons) == len(DEPENDS)  # none of 'size'
@@ -109,6 +112,7 @@ def test_what_depends_on_a_condition_is_refused_with_token_and_condition(tmp_pat
         assert f"It depends on {condition}, something that is not a token." in reason
 
 
+@fresh
 def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_shows_it(tmp_path):
     reasons = reasons_against([source for source, _ in IMPORTED.values()], tmp_path / "bundle")
     for number, (reason, (_, condition)) in enumerate(zip(reasons, IMPORTED.values(), strict=True)):
@@ -117,32 +121,32 @@ def test_what_an_import_makes_under_a_condition_is_refused_also_where_no_sample_
         )
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        # Neither the text nor the snapshot of mutable objects shows it, and in the notebook it is constant by now.
+def test_a_function_that_keeps_something_from_call_to_call_is_refused(tmp_path):
+    # Neither the text nor the snapshot of mutable objects shows it, and in the notebook it is constant by now.
+    sources = (
         "import threading\ndef use(x):\n    return threading.stack_size(1 << 24)",
         "import gc\ndef use(x):\n    before = gc.get_threshold()[0]\n    gc.set_threshold(1500)\n    return before",
-    ],
-)
-def test_a_function_that_keeps_something_from_call_to_call_is_refused(source, tmp_path):
-    text = refusal(source, tmp_path / "bundle")
-    assert "token 'used_0': " in text
-    assert "It depends on when, how often and in which order function 'use_0' is called" in text
+    )
+    reasons = reasons_against(sources, tmp_path / "bundle")
+    assert len(reasons) == len(sources)
+    for number, reason in enumerate(reasons):
+        assert f"token 'used_{number}': " in reason
+        assert f"It depends on when, how often and in which order function 'use_{number}' is called" in reason
 
 
-@pytest.mark.parametrize(
-    "source",
-    [
-        # A bundle puts these back after each call, so that they are what they were before the notebook's first run.
+def test_a_function_that_reads_a_setting_which_it_has_left_is_refused(tmp_path):
+    # A bundle puts these back after each call, so that they are what they were before the notebook's first run.
+    sources = (
         "import numpy as np\ndef use(x):\n    return np.seterr(all='ignore')['over']",
         "import sys\ndef use(x):\n    before = sys.getrecursionlimit()\n    sys.setrecursionlimit(1500)\n    return before",
-    ],
-)
-def test_a_function_that_reads_a_setting_which_it_has_left_is_refused(source, tmp_path):
-    assert "token 'used_0': " in refusal(source, tmp_path / "bundle")
+    )
+    reasons = reasons_against(sources, tmp_path / "bundle")
+    assert len(reasons) == len(sources)
+    for number, reason in enumerate(reasons):
+        assert f"token 'used_{number}': " in reason
 
 
+@fresh
 def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):
     source = "import time\ndef use(x):\n    assert time.localtime(0).tm_min != 37, 'late'\n    return x"
     text = refusal(source, tmp_path / "bundle")
@@ -195,6 +199,7 @@ def test_changed_print_options_of_numpy_are_refused_where_a_function_writes_an_a
         ep.promote(runner, tmp_path / "bundle")
 
 
+@fresh
 def test_each_number_of_threads_is_varied_from_what_it_is_set_to(tmp_path, monkeypatch):
     monkeypatch.setenv("OPENCV_FOR_THREADS_NUM", "1")
     before = cv2.getNumThreads()
@@ -225,6 +230,7 @@ def test_a_function_that_counts_is_refused(tmp_path):
     assert "'use_0'" in text
 
 
+@fresh
 def test_noise_that_the_number_of_threads_makes_is_tolerated_as_such(tmp_path):
     source = (
         "import cv2, numpy as np\ndef use(x):\n    parts = np.array_split(x, cv2.getNumThreads() + 1)\n"

@@ -94,6 +94,8 @@ def changed_attributes(
         )
         for name, value in described.items() if others else ():
             other = others.get(name, "")
+            if value == other:
+                continue
             last = name.rpartition(".")[2]
             if not other:
                 # A lazy package gets its modules, and what they are for, when these are first asked for.
@@ -105,13 +107,13 @@ def changed_attributes(
                 is_changed &= not last.startswith("_") or value.startswith(_OWN)
                 is_changed &= "." not in name or not _is_object_of(module, value, other)
                 is_changed |= last in named_here and name not in _left_by_loops(module)
-                is_changed &= other != value and (other != "None" or last in named_here)
+                is_changed &= other != "None" or last in named_here
                 is_changed &= not value.startswith(OF_NOTEBOOKS)
             # A text or number in a dict of the module: not the members that an enumeration remembers.
             is_entry = (
                 registers and "[" in name and "." not in name.partition("[")[0] and value.startswith(_BEGIN_AN_ATOM)
             )
-            if is_changed or (is_entry and value != other):
+            if is_changed or is_entry:
                 found[module, name] = value, other
     return found
 
