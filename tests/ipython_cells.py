@@ -10,10 +10,12 @@ from pathlib import Path
 
 PROGRAM = """
 import json, sys
+from IPython.core.history import HistoryManager
 from IPython.core.interactiveshell import InteractiveShell
 from IPython.utils.capture import capture_output
 
 cells, mode = json.loads(sys.argv[1])
+HistoryManager.enabled = False
 shell = InteractiveShell.instance()
 shell.run_line_magic("colors", "nocolor")
 shell.run_line_magic("xmode", mode)
@@ -23,7 +25,8 @@ shell.displayhook.write_format_data = lambda data, metadata=None: shell.display_
 shown = []
 for cell in cells:
     with capture_output() as captured:
-        succeeded = shell.run_cell(cell).success
+        # Counted, as in a notebook.
+        succeeded = shell.run_cell(cell, store_history=True).success
     shown.append([succeeded, captured.stdout, [output.data for output in captured.outputs]])
 print("SHOWN", json.dumps(shown))
 """

@@ -3,6 +3,7 @@
 - ``acquisition``: several cameras at once, each with a thread that keeps its recent frames (``frames``)
 - ``cameras``: a camera of any source, and its frames per second
 - ``device``: cameras with a node map, found by ``basler`` and ``genicam``; ``camera_settings``, ``pixel_formats``
+- ``device_owner``: which camera of this process has a device
 - ``files``: image files and folders
 - ``video``: the frames of a video file as a sequence of images
 """

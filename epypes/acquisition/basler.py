@@ -5,12 +5,12 @@ from __future__ import annotations
 import select
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
 from epypes.acquisition.camera_settings import CameraSetting
-from epypes.acquisition.device import FoundCamera, Grabbed, held
+from epypes.acquisition.device import FoundCamera, Grabbed
 from epypes.acquisition.pixel_formats import to_image
 from epypes.errors import CameraUnavailable, InvalidValue, UnknownName
 from epypes.optional import optional_import
@@ -27,6 +27,7 @@ _KINDS: Final = {
     genicam.intfIEnumeration: "choice",
     genicam.intfIString: "text",
 }
+_COMMAND: Final = (genicam.intfICommand,)
 # pylon closes a camera of GigE Vision that has not answered for this long; USB reports a removal at once.
 _HEARTBEAT_MS: Final = 1_000
 _LAST_GIGE_ID: Final = 65_535
@@ -55,8 +56,6 @@ class Backend:
         with _lock:
             try:
                 camera = _made[name] if name in _made else pylon.InstantCamera(self._factory.CreateDevice(info))
-                if camera.IsOpen():
-                    raise held(found.address)
                 camera.Open()
                 _made[name] = camera
                 return BaslerDevice(camera, found.address)
@@ -101,13 +100,16 @@ class BaslerDevice:
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the features that have a value, as the node map orders them."""
-        return tuple(node.GetNode().GetName() for node in self._nodes.GetNodes() if _is_setting(node))
+        return self._features(_KINDS)
+
+    def _features(self, kinds: Collection[int]) -> tuple[str, ...]:
+        return tuple(node.GetNode().GetName() for node in self._nodes.GetNodes() if _is_feature(node, kinds))
 
     def setting(self, name: str) -> CameraSetting | None:
         """Return a feature with its value and range; None if there is none of this name."""
         self._require_there()
         node = self._nodes.GetNode(name)
-        if not _is_setting(node):
+        if not _is_feature(node, _KINDS):
             return None
         kind: Any = _KINDS[node.GetNode().GetPrincipalInterfaceType()]
         has_range = kind in ("int", "float")
@@ -133,8 +135,8 @@ class BaslerDevice:
     def execute(self, name: str) -> None:
         """Run a command; UnknownName if there is none of this name."""
         node = self._nodes.GetNode(name)
-        if not genicam.IsAvailable(node) or node.GetNode().GetPrincipalInterfaceType() != genicam.intfICommand:
-            raise UnknownName("command", name, ("TriggerSoftware",), "of this camera")
+        if not _is_feature(node, _COMMAND):
+            raise UnknownName("command", name, self._features(_COMMAND), "of this camera")
         with self._asked(f"{name} can't be run now"):
             node.Execute()
 
@@ -210,12 +212,12 @@ class BaslerDevice:
         return CameraUnavailable(self._address, f"Camera {self._address!r} gives no frames: {_reason(error)}")
 
 
-def _is_setting(node: Any) -> bool:
+def _is_feature(node: Any, kinds: Collection[int]) -> bool:
     if not genicam.IsAvailable(node):
         return False
     inner = node.GetNode()
     return bool(
-        inner.IsFeature() and inner.GetPrincipalInterfaceType() in _KINDS and inner.GetVisibility() < genicam.Invisible
+        inner.IsFeature() and inner.GetPrincipalInterfaceType() in kinds and inner.GetVisibility() < genicam.Invisible
     )
 
 

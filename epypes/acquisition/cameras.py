@@ -13,6 +13,7 @@ from time import monotonic
 from typing import Any, Final, Protocol, TypeVar, cast, runtime_checkable
 
 from epypes.acquisition.device import BACKENDS, DeviceCamera
+from epypes.acquisition.device_owner import DeviceOwner
 from epypes.acquisition.files import image_files, is_image_file, quiet_opencv, read_image
 from epypes.acquisition.frames import Frame, frame_image, frame_of, frames_read, next_due_s
 from epypes.acquisition.video import Video
@@ -90,7 +91,7 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
     ImageFileError
         A file or folder can't be read.
     CameraUnavailable
-        A device or stream can't be opened.
+        A device or stream can't be opened, or a camera of this process has the device and is not closed.
     MissingPackage
         The library of such a camera is not installed.
     TypeError, ValueError
@@ -167,14 +168,20 @@ def _of_capture(source: Any, fps: float | None, loop: bool, opening: Callable[[]
     if isinstance(source, int | str):
         # A URL may hold a password.
         name = "Camera " + re.sub(r"//[^/@]*@", "//", str(source))
-        opening = partial(_opened, source, name)
-        return LiveCamera(name, opening(), opening, fps)
+        return LiveCamera(name, None, partial(_opened, source, name), fps, _device_of(source))
     if not source.isOpened():
         raise CameraUnavailable("The capture", "The capture that was given is not open. Check it with isOpened().")
     # A file has an end, and never runs ahead.
     if source.get(cv2.CAP_PROP_FRAME_COUNT) > 0:
         return _capture_camera(source, opening, fps, loop)
     return LiveCamera("The capture", source, opening, fps)
+
+
+def _device_of(source: int | str) -> str:
+    """Return the device file of a source that one camera has for itself; "" for a stream, which many may read."""
+    if isinstance(source, int):
+        return f"/dev/video{source}"
+    return "" if "://" in source else str(Path(source).resolve())
 
 
 def _opened(source: int | str, name: str) -> Any:
@@ -355,7 +362,7 @@ def paced(camera: Camera, fps: float | None, usual_fps: float = math.inf) -> Ite
 # -- on OpenCV's VideoCapture -----------------------------------------------------------------------------------------
 
 
-class LiveCamera:
+class LiveCamera(DeviceOwner):
     """The newest frames of a device or a stream; one thread reads it, and any closes it.
 
     OpenCV must not release a capture while it is read, so the thread that is done last releases it.
@@ -365,21 +372,27 @@ class LiveCamera:
     name
         Of the camera, for errors.
     capture
-        A capture that is open.
+        A capture that is open; None to open it now.
     opening
         Returns such a capture again, after `close`. Without it, the capture belongs to the caller and stays open.
     fps
         Frames per second at most. All are taken from the driver, so that none grows old there; those in between are
         not decoded. None: every frame.
+    device
+        What no other camera of this process opens meanwhile; "" for none.
     """
 
-    def __init__(self, name: str, capture: Any, opening: Callable[[], Any] | None, fps: float | None) -> None:
-        self._name, self._capture, self._opening = name, capture, opening
+    def __init__(
+        self, name: str, capture: Any, opening: Callable[[], Any] | None, fps: float | None, device: str = ""
+    ) -> None:
+        super().__init__()
+        self._name, self._opening, self._device = name, opening, device
         self._period_s = 0.0 if fps is None else 1 / fps
         self._due_s = -math.inf
         self._misses = 0
         self._lock = threading.Lock()
         self._is_closed = False
+        self._capture = self._open() if capture is None else capture
 
     def read(self) -> Any:
         """Return the next frame; None if `close` was called meanwhile.
@@ -389,10 +402,11 @@ class LiveCamera:
         CameraUnavailable
             It gave none. After three in a row, it is opened again, unless it is the caller's.
         """
+        self._last_reader = threading.current_thread()
         with self._lock:
             self._is_closed = False
-            if self._capture is None and self._opening is not None:
-                self._capture = self._opening()
+            if self._capture is None:
+                self._capture = self._open()
             image = self._next(self._capture)
         is_closed = self._is_closed
         self._misses = 0 if is_closed or image is not None else self._misses + 1
@@ -402,9 +416,14 @@ class LiveCamera:
             raise CameraUnavailable(self._name, f"{self._name} gave no frame.")
         return image
 
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield frames without end, until `close` is called; CameraUnavailable if the camera gives none."""
-        return frames_read(self)
+    def _open(self) -> Any:
+        if self._device:
+            self._own(self._device)
+        try:
+            return self._opening() if self._opening is not None else None
+        except BaseException:
+            self._disown()
+            raise
 
     def _next(self, capture: Any) -> Any:
         while capture.grab() and not self._is_closed:
@@ -423,6 +442,7 @@ class LiveCamera:
                 if capture is not None:
                     capture.release()
             finally:
+                self._disown()
                 self._lock.release()
 
 

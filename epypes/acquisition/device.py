@@ -10,13 +10,14 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final, Protocol, Self
 
 from epypes.acquisition.camera_settings import CameraSettings, NodeMap
-from epypes.acquisition.frames import Frame, FrameCamera, frames_read, next_due_s
+from epypes.acquisition.device_owner import DeviceOwner
+from epypes.acquisition.frames import Frame, FrameCamera, next_due_s
 from epypes.errors import CameraUnavailable, MissingPackage
 from epypes.wording import counted
 
@@ -152,7 +153,7 @@ def find_cameras() -> tuple[list[FoundCamera], list[MissingPackage]]:
     return found, missing
 
 
-class DeviceCamera(FrameCamera):
+class DeviceCamera(DeviceOwner, FrameCamera):
     """A camera with a node map; made by ``ep.camera("basler:SERIAL")`` or ``ep.camera("genicam:SERIAL")``.
 
     Attributes
@@ -171,6 +172,7 @@ class DeviceCamera(FrameCamera):
     """
 
     def __init__(self, address: str, fps: float | None = None) -> None:
+        super().__init__()
         self.address = address
         kind, _, self._wanted = address.partition(":")
         self._backend = backend(kind)
@@ -218,7 +220,7 @@ class DeviceCamera(FrameCamera):
         ValueError
             Its pixel format can't be read.
         """
-        self._is_closed, self._reader = False, threading.get_ident()
+        self._is_closed, self._reader, self._last_reader = False, threading.get_ident(), threading.current_thread()
         try:
             grabbed = None
             while grabbed is None and not self._is_closed:
@@ -233,10 +235,6 @@ class DeviceCamera(FrameCamera):
             self._reader = None
             if self._is_closed:
                 self.close()
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield frames without end, until `close` is called; CameraUnavailable if the camera is gone."""
-        return frames_read(self)
 
     def trigger(self) -> None:
         """Give the camera a trigger, if its ``TriggerMode`` is ``On`` and its ``TriggerSource`` is ``Software``."""
@@ -316,23 +314,20 @@ class DeviceCamera(FrameCamera):
 
     def _open(self) -> Device:
         found = self._found()
-        if not found.is_free:
-            other = _open_cameras.get(found.address)
-            if other is None or other._reader is not None:
-                raise held(self.address)
-            # A cell that is run again opens its camera while the name still has the former one.
-            other.close()
-            found = self._found()
-        device = self._backend.open(found)
-        try:
+        self._own(found.address)
+        with ExitStack() as undone:
+            undone.callback(self._disown)
+            # It may have been that of a camera which gave way.
+            if not found.is_free and not (found := self._found()).is_free:
+                text = f"Camera {self.address!r} is held: another program has it. Close it there."
+                raise CameraUnavailable(self.address, text)
+            device = self._backend.open(found)
+            undone.callback(device.close)
             self.settings.restore(device)
-        except BaseException:
-            device.close()
-            raise
+            undone.pop_all()
         # A camera that is dropped without `close` lets go of its device, too.
         self._finalizer = weakref.finalize(self, device.close)
         self._finalizer.atexit = False
-        _open_cameras[found.address] = self
         return device
 
     def _found(self) -> FoundCamera:
@@ -356,17 +351,10 @@ class DeviceCamera(FrameCamera):
                 self._finalizer.detach()
                 self._outages += is_gone
                 self._closed_counts = _sums(self._closed_counts, _counts(device))
-                device.close()
-
-
-# The camera of this process that has opened an address.
-_open_cameras: Final[weakref.WeakValueDictionary[str, DeviceCamera]] = weakref.WeakValueDictionary()
-
-
-def held(address: str) -> CameraUnavailable:
-    """Return the error for a camera that is open elsewhere."""
-    text = f"Camera {address!r} is held: another program, or a thread of this one, reads it. Close it there."
-    return CameraUnavailable(address, text)
+                try:
+                    device.close()
+                finally:
+                    self._disown()
 
 
 def _sums(one: tuple[int, int, int], other: tuple[int, int, int]) -> tuple[int, int, int]:

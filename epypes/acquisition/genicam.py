@@ -148,7 +148,8 @@ class GenicamDevice:
         """Run a command; UnknownName if there is none of this name."""
         info = self._camera.node_info(name)
         if info is None or info.kind != "Command":
-            raise UnknownName("command", name, ("TriggerSoftware",), "of this camera")
+            commands = [each.name for each in self._camera.all_node_info() if each.kind == "Command"]
+            raise UnknownName("command", name, commands, "of this camera")
         with self._asked(f"{name} can't be run now"):
             self._camera.execute(name, wait=False)
 

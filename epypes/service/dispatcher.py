@@ -119,9 +119,10 @@ class Dispatcher:
         self.answered_in_row = 0
         self._policy, self._size, self._slots = options.mailbox_policy, options.capacity, options.threads
         self._max_deaths = options.retries
-        # A broker keeps events while there is no room, and confirms their answers: they are in flight until then.
-        self._has_broker, self._is_confirmed = options.has_broker, options.is_confirmed
+        # A broker keeps events while there is no room.
+        self._has_broker = options.has_broker
         self._results, self._provenance = results, provenance
+        results.on_settled = self._settled
         self._connection: WorkerConnection | None = None
         self._holds: set[str] = set()
         self._why_refused, self._waiting_threads = "", 0
@@ -191,7 +192,7 @@ class Dispatcher:
         """Drop an event, which is published at once and not in the order of acceptance."""
         self._totals["dropped"] += 1
         event.result = dropped_result(event, reason, self._provenance())
-        self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
+        self._to_publish.append(partial(self._results.publish, event, event.result))
 
     def _has_room(self) -> bool:
         """Whether an event that comes now is neither dropped nor has another one dropped."""
@@ -333,12 +334,9 @@ class Dispatcher:
             self._release(eldest, eldest.result)
 
     def _release(self, event: AcceptedEvent, result: Result) -> None:
-        """Have a result published and counted; if a broker confirms it, it is in flight until then."""
-        if self._is_confirmed:
-            self._unconfirmed[event.seq] = event
-        else:
-            self._totals[result.outcome] += 1
-        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
+        """Have a result published; the event is in flight until its answer is confirmed."""
+        self._unconfirmed[event.seq] = event
+        self._to_publish.append(partial(self._results.publish, event, result))
 
     def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
         """Note that the worker died by itself, or of one of its events; they are tried again, or are dead letters."""
@@ -475,17 +473,10 @@ class Dispatcher:
                     self._publishing_thread = 0
 
     def _settled(self, event: AcceptedEvent, result: Result, error: Exception | None) -> None:
-        """Note that an answer is confirmed; without that, the broker that keeps the event delivers it again."""
+        """Count an event whose answer is confirmed; without that, the broker that keeps the event delivers it again."""
         is_returned = error is not None and self._has_broker
         if error is not None and not is_returned:
             result = self._results.report_lost(event, result, error)
-        if not self._is_confirmed:
-            if event.result is not None and event.result.outcome != result.outcome:
-                # It was counted when it was released; a failure has replaced the answer, which can't be published.
-                with self.lock:
-                    self._totals[event.result.outcome] -= 1
-                    self._totals[result.outcome] += 1
-            return
         if event.seq not in self._unconfirmed:
             # It was given back meanwhile, or dropped.
             return

@@ -85,11 +85,6 @@ class Options:
         return is_broker(self.sub)
 
     @property
-    def is_confirmed(self) -> bool:
-        """Whether a broker confirms an answer, or the end of an event."""
-        return self.has_broker or is_broker(self.pub)
-
-    @property
     def shows_failures(self) -> bool:
         """Whether the address of failures is shown: with a broker failures arrive as answers anyway."""
         return not self.has_broker or self.failures != ANY_PORT

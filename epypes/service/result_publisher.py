@@ -1,6 +1,7 @@
 """Results of events: how they are published, and reported to the failure store, the event log and listeners.
 
-The sender gets the answer first. When the answer is confirmed, the result is counted, logged and kept.
+The sender gets the answer first. When the answer is confirmed, the result is logged, kept and counted: a ZeroMQ socket,
+DDS and Zenoh confirm what they have taken.
 """
 
 from __future__ import annotations
@@ -310,6 +311,11 @@ class ResultPublisher:
         Returns what events are computed with now.
     tracer
         Makes the spans of events; None for none.
+
+    Attributes
+    ----------
+    on_settled
+        Called with an event, the result that was published, and None; or with the reason why it was not.
     """
 
     def __init__(
@@ -324,6 +330,7 @@ class ResultPublisher:
         self._answers, self._failures, self._tracer = answers, failures, tracer
         self._store, self._event_log, self._provenance = store, event_log, provenance
         self._listeners: list[Listener] = []
+        self.on_settled: Callable[[AcceptedEvent, Result, Exception | None], object] = lambda *_: None
         self.latency = LatencyHistogram()
         self._throttle = Throttle(_log)
 
@@ -345,20 +352,9 @@ class ResultPublisher:
             except Exception:
                 _log.exception("a listener failed")
 
-    def publish(
-        self,
-        event: AcceptedEvent,
-        result: Result,
-        on_settled: Callable[[AcceptedEvent, Result, Exception | None], object],
-    ) -> None:
-        """Publish the answers to an event, and report its result once they are confirmed.
-
-        Parameters
-        ----------
-        on_settled
-            Called with the result that was published, and None; or with the reason why it was not.
-        """
-        confirmed: Confirmed = partial(self._confirmed, event, result, on_settled)
+    def publish(self, event: AcceptedEvent, result: Result) -> None:
+        """Publish the answers to an event, and report its result once they are confirmed."""
+        confirmed: Confirmed = partial(self._confirmed, event, result)
         if not result.answers:
             confirmed(None)
             return
@@ -369,23 +365,19 @@ class ResultPublisher:
             own_id = f"{event.id}/{number}" if event.id and number > 1 else event.id
             self._answers.publish(answer, own_id, confirmed)
 
-    def _confirmed(
-        self,
-        event: AcceptedEvent,
-        result: Result,
-        on_settled: Callable[[AcceptedEvent, Result, Exception | None], object],
-        error: Exception | None,
-    ) -> None:
+    def _confirmed(self, event: AcceptedEvent, result: Result, error: Exception | None) -> None:
         if isinstance(error, MessageError):
             if result.failure is None:
                 # It can never be sent, so the sender gets that as a failure.
                 refusal = failed_result(event, error, self._provenance(), "raised", function="f_out")
-                self.publish(event, refusal, on_settled)
+                self.publish(event, refusal)
                 return
             error = None
-        if error is None:
-            self._report(event, result)
-        on_settled(event, result, error)
+        try:
+            if error is None:
+                self._report(event, result)
+        finally:
+            self.on_settled(event, result, error)
 
     def report_lost(self, event: AcceptedEvent, result: Result, error: Exception) -> Result:
         """Report an event whose answer was lost and that no broker keeps; return its result."""

@@ -17,8 +17,7 @@ from epypes.errors import AddressError, MessageError
 from epypes.service.bundle_info import BundleInfo
 from epypes.service.options import Options
 from epypes.transport.address import Address, parse_address
-from epypes.transport.channel import ChannelOptions
-from epypes.transport.peers.ros import RosCodec
+from epypes.transport.peers.ros import ros_type_of
 from epypes.wire import Envelope
 from epypes.wire.samples import read_sample
 
@@ -51,7 +50,7 @@ def with_input_name(options: Options, bundle: BundleInfo) -> Options:
 
 def _check_answers(pub: Address, bundle: BundleInfo) -> None:
     token, outputs, rgb = pub.options.get("token", ""), bundle.settings.outputs, bundle.settings.rgb
-    ros = RosCodec(pub, ChannelOptions()).type
+    ros = ros_type_of(pub)
     _check_name(pub, token, outputs, "output")
     refusal: MessageError | None = None
     for path in sorted((bundle.path / SAMPLES).glob("*.npz")):

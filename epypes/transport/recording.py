@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from epypes.errors import AddressError, BrokerError, InvalidValue, RecordingError, StillRunning
-from epypes.transport.address import open_channel, parse_address
+from epypes.transport.address import Address, open_channel, parse_address
 from epypes.transport.channel import Delivery, Frames
 from epypes.transport.endpoint import Startable, warn_left_running
 from epypes.transport.mcap import BrokenOff, Recorded, RecordingCounts, RecordingWriter, messages
 from epypes.transport.peers.channel import PeerChannel
-from epypes.transport.subscriber import Subscriber, ZMQSubscriber
+from epypes.transport.subscriber import Subscriber
 from epypes.transport.zeromq.channel import ZeroMQChannel
 from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
 
@@ -100,6 +100,15 @@ class _FileThread:
             raise failure
 
 
+def _without_broker(address: str, why: str) -> Address:
+    """Return a parsed address; AddressError, with the reason, if it is that of a broker."""
+    parsed = parse_address(address)
+    if parsed.is_broker:
+        text = f"{parsed} is an address of a broker: {why}. Give one of ZeroMQ, DDS or Zenoh."
+        raise AddressError(str(parsed), text)
+    return parsed
+
+
 class Recorder(Startable):
     """Writes published messages into an MCAP file, each as it arrived, with the time of its arrival.
 
@@ -152,14 +161,12 @@ class Recorder(Startable):
         **options: Any,
     ) -> None:
         self.path = Path(path)
-        parsed = parse_address(address)
+        parsed = _without_broker(address, "a recording would take its messages from other consumers")
         about = {"address": parsed.endpoint, "topic": topic}
-        # The one for ZeroMQ alone refuses a broker: a recording would take messages from other consumers.
-        kind = ZMQSubscriber if parsed.is_broker else Subscriber
 
         def make() -> tuple[Subscriber, _Recording]:
             recording = _Recording(self.path, about, force, messages, backlog_bytes, on_end)
-            return kind(parsed, recording, topic, bind, undecoded=True, **options), recording
+            return Subscriber(parsed, recording, topic, bind, undecoded=True, **options), recording
 
         self._make = make
         # Made at once, so that the constructor refuses wrong arguments. They are two objects, so that the recorder's
@@ -409,16 +416,12 @@ class Player(Startable):
             raise InvalidValue(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
         if loop < 0:
             raise InvalidValue(f"loop is {loop}; give how often, or 0 for without end.")
-        parsed = parse_address(address)
+        parsed = _without_broker(address, "no recording is played to it")
         self._given = parsed.endpoint
         self.path = Path(path)
         if parsed.is_zeromq:
             binds = bind if parsed.binds is None else parsed.binds
             security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
-        elif parsed.is_broker:
-            raise AddressError(
-                self._given, f"{self._given} is an address of a broker, to which no recording is played."
-            )
 
         def make() -> _Playback:
             channel: ZeroMQChannel | PeerChannel

@@ -295,6 +295,25 @@ def test_a_capture_is_never_released_while_it_is_read():
     assert not capture.released_while_reading
 
 
+def test_a_device_is_open_once_and_a_stream_as_often_as_one_likes(monkeypatch):
+    def opened(source):
+        capture = SlowCapture()
+        capture.go.set()
+        return capture
+
+    monkeypatch.setattr(cv2, "VideoCapture", opened)
+    with pytest.raises(CameraUnavailable, match=r"'/dev/video0' is open already, by line \d+ of test_cameras\.py"):
+        [ep.camera(source) for source in (0, "/dev/video0")]
+    first = ep.camera("/dev/video0")
+    first.close()
+    second = ep.camera(0)
+    with pytest.raises(CameraUnavailable, match="is open already"):
+        first.read()
+    assert len({ep.camera("rtsp://127.0.0.1/film") for _ in range(2)}) == 2
+    del second
+    assert first.read() is not None
+
+
 def test_the_password_of_a_stream_is_not_told():
     with pytest.raises(CameraUnavailable) as info:
         ep.camera("nothing://me:secret@127.0.0.1/film")

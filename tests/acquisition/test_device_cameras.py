@@ -22,6 +22,7 @@ from epypes.acquisition import find_cameras
 from epypes.acquisition.pixel_formats import to_image
 from epypes.errors import CameraUnavailable, MissingPackage
 from tests.fake_camera import FakeCamera
+from tests.ipython_cells import run_cells
 
 pytestmark = pytest.mark.slow
 
@@ -95,8 +96,10 @@ def test_what_a_setting_can_not_be_is_refused_with_its_range(camera):
         camera.settings["PixelFormat"] = "Mono9"
     with pytest.raises(KeyError, match=r"No setting 'Widht' of this camera\. Did you mean 'Width'\?"):
         camera.settings["Widht"] = 3
-    with pytest.raises(KeyError, match=r"No command 'Trigger' of this camera"):
-        camera.settings.execute("Trigger")
+    with pytest.raises(KeyError, match=r"No command 'Width' of this camera\. There are: .*TriggerSoftware"):
+        camera.settings.execute("Width")
+    with pytest.raises(KeyError, match=r"No command 'TriggerSoft' of this camera\. Did you mean 'TriggerSoftware'"):
+        camera.settings.execute("TriggerSoft")
     assert camera.read().shape == (64, 96)
 
 
@@ -304,18 +307,34 @@ def test_a_wrong_serial_number_is_told_with_those_that_are_there(fake):
         assert only.read() is not None
 
 
-def test_a_camera_that_no_thread_reads_gives_way_as_to_a_cell_that_is_run_again(camera):
-    assert camera.read() is not None
-    with ep.camera(camera.address) as again:
-        assert again.read() is not None
-        assert "closed" in repr(camera)
-        with ep.ImageAcquisition(again) as acquisition:
+def test_a_device_belongs_to_the_camera_that_opened_it_until_that_is_closed(camera):
+    opened_at = f"'{camera.address}' is open already, by line [0-9]+ of test_device_cameras.py"
+    for frame in camera:
+        with pytest.raises(CameraUnavailable, match=rf"{opened_at}\. End the loop"):
+            ep.camera(camera.address)
+        if frame.number:
+            break
+    with pytest.raises(CameraUnavailable, match=rf"{opened_at}\. Close that camera first"):
+        ep.camera(camera.address)
+    camera.close()
+    with ep.camera(camera.address) as other:
+        with ep.ImageAcquisition(other) as acquisition:
             assert acquisition.wait_for_frames(60)
-            with pytest.raises(
-                CameraUnavailable, match=f"'{camera.address}' is held: .* a thread of this one, reads it"
-            ):
+            with pytest.raises(CameraUnavailable, match=rf"{opened_at}\. End .* the acquisition"):
                 camera.read()
+        assert other.read() is not None
     assert camera.read() is not None
+
+
+def test_a_cell_that_is_run_again_has_its_camera_again(emulated):
+    opening = f"camera = ep.camera({BASLER!r}, fps=20)\nprint(camera.read().shape)"
+    looping = f"for frame in camera:\n    ep.camera({BASLER!r})"
+    first, again, stopped, twice, last = run_cells(
+        f"import epypes as ep\n{opening}", opening, looping, f"{opening}\n{opening}", opening
+    )
+    assert all(cell.succeeded and "(1040, 1024)" in cell.text for cell in (first, again, last))
+    assert f"'{BASLER}' is open already, by line 1 of Cell In[2]. End the loop" in stopped.text
+    assert f"'{BASLER}' is open already, by line 1 of Cell In[4]. Close that camera" in twice.text
 
 
 def test_a_camera_that_is_dropped_is_closed(fake):
@@ -330,7 +349,7 @@ def test_a_camera_that_another_process_holds_is_told_so(fake):
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "holds\n"
-        with pytest.raises(CameraUnavailable, match=r"'genicam:EP01' is held: another program.*Close it there"):
+        with pytest.raises(CameraUnavailable, match=r"'genicam:EP01' is held: another program has it\. Close it"):
             ep.camera(GENICAM)
         assert [found.is_free for found in find_cameras()[0] if found.serial == "EP01"] == [False]
         other.communicate("\n", timeout=60)

@@ -99,6 +99,7 @@ def test_each_message_that_nobody_should_send_is_counted_and_the_good_one_after_
         while (answer := answers.get(timeout=WAIT_S)).correlation_id != good.id:
             pass
         assert np.array_equal(answer.parts["edges"], cv2.Canny(cv2.medianBlur(image, 5), 70, 200))
+        wait_until(lambda: not service.counts()["in_flight"], WAIT_S)
         counts = service.counts()
         assert service.state == "READY"
         assert service.info()["worker_pid"] == worker

@@ -617,6 +617,14 @@ def test_an_existing_file_is_kept_unless_force_is_given(tmp_path):
     assert threads_of_recording() == []
 
 
+def test_the_queue_of_a_broker_is_neither_recorded_nor_played_to(tmp_path):
+    address, refused = "nats://me:secret@127.0.0.1/events", "^nats://me@127.0.0.1:4222/events is an address of a broker"
+    with pytest.raises(AddressError, match=f"{refused}: .*messages from other consumers. Give one of ZeroMQ"):
+        Recorder(address, tmp_path / "a.mcap")
+    with pytest.raises(AddressError, match=f"{refused}: no recording is played to it"):
+        Player(tmp_path / "a.mcap", address)
+
+
 def test_a_place_that_can_not_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
     for place in (tmp_path / "no" / "a.mcap", tmp_path / "file" / "a.mcap"):

@@ -63,7 +63,7 @@ class DDSSession(PeerSession):
         super().__init__(address, options)
         self._number = domain_of(address)
         check_topic(address)
-        self._codec = codec_of(address, options)
+        self._codec, self._sample_type = codec_of(address, options)
         self._type_name = ""
         self._qos: Any = None
         self._reader: Any = None
@@ -81,7 +81,7 @@ class DDSSession(PeerSession):
         qos = self._qos = qos_of(address, is_receiver)
         participant = domains.join(self, self._number)
         try:
-            topic = Topic(participant, address.name, self._codec.sample_type)
+            topic = Topic(participant, address.name, self._sample_type)
         except DDSException as error:
             why = "write its name with letters, digits, _ and /"
             if error.code != DDSException.DDS_RETCODE_BAD_PARAMETER:
@@ -109,7 +109,7 @@ class DDSSession(PeerSession):
         if writer is None:
             raise BrokerError(str(self.address), f"A message to {self.address} was not sent: the channel is closed.")
         try:
-            writer.write(self._codec.sample_type(cdr))
+            writer.write(self._sample_type(cdr))
         except DDSException as error:
             text = f"A message to {self.address} was not sent: {error}."
             raise BrokerError(str(self.address), text) from error
@@ -157,7 +157,7 @@ class DDSSession(PeerSession):
         while self._reader is not None and not self._stop.read() and (samples := self._reader.take(_BATCH)):
             for sample in samples:
                 # Another sample is only the news that a writer has gone.
-                if isinstance(sample, self._codec.sample_type):
+                if isinstance(sample, self._sample_type):
                     self._deliver(sample.cdr)
 
     def _deliver(self, cdr: bytes) -> None:

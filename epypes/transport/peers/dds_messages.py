@@ -17,7 +17,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_typestore
 
 from epypes.transport.address import Address
-from epypes.transport.channel import NO_HEADERS, ChannelOptions, Frames
+from epypes.transport.channel import ChannelOptions, Frames
 from epypes.transport.peers.ros import RosCodec
 from epypes.wire.ros import dds_name, typestore
 
@@ -72,11 +72,13 @@ def _sample_type(store: Typestore, name: str) -> type[IdlStruct]:
     class Sample(IdlStruct, typename=dds_name(name)):  # type: ignore[misc, call-arg]
         __annotations__ = _fields(store, name)
 
-        def __init__(self, cdr: bytes) -> None:
+        def __init__(self, cdr: bytes | memoryview) -> None:
             self.cdr = cdr
 
         def serialize(self, *arguments: object, **keywords: object) -> bytes:
-            return self.cdr
+            # Cyclone wants its length aligned, which that of rosbags is not.
+            missing = -len(self.cdr) % 4
+            return b"".join((self.cdr, bytes(missing))) if missing else bytes(self.cdr)
 
         @classmethod
         def deserialize(cls, data: bytes, *arguments: object, **keywords: object) -> Self:
@@ -96,7 +98,7 @@ class MessageCodec:
         self.sample_type: Any = _sample_type(self._store, _MESSAGE)
 
     def pack(self, frames: Frames, id: str, headers: Mapping[str, str]) -> bytes:  # noqa: A002
-        """Return the bytes of a sample, with one copy of the frames: what rosbags makes is not aligned at its end."""
+        """Return the bytes of a sample, of aligned length, with one copy of the frames."""
         parts: list[bytes | memoryview] = [_LITTLE_ENDIAN]
         size = 0
 
@@ -134,29 +136,15 @@ def _ros_sample_type(name: str) -> Any:
     return _sample_type(typestore(), name)
 
 
-class RosMessageCodec:
-    """Packs and unpacks messages of ROS 2, which carry neither id nor headers."""
-
-    def __init__(self, address: Address, options: ChannelOptions) -> None:
-        self._codec = RosCodec(address, options)
-        self.sample_type = _ros_sample_type(self._codec.type.name)
-
-    def pack(self, frames: Frames, id: str, headers: Mapping[str, str]) -> bytes:  # noqa: A002
-        """Return the bytes of a sample; MessageError if the frames are no Envelope that fits."""
-        cdr = self._codec.pack(frames)
-        return b"".join((cdr, bytes(-len(cdr) % 4)))
-
-    def unpack(self, cdr: bytes) -> tuple[Frames, str, Mapping[str, str]]:
-        """Return the frames of an Envelope, and a new id; MessageError if the bytes are no such message."""
-        return *self._codec.unpack(cdr), NO_HEADERS
-
-
-def codec_of(address: Address, options: ChannelOptions) -> MessageCodec | RosMessageCodec:
-    """Return what packs and unpacks the messages of an address.
+def codec_of(address: Address, options: ChannelOptions) -> tuple[MessageCodec | RosCodec, Any]:
+    """Return what packs and unpacks the messages of an address, and the class of its topic's samples.
 
     Raises
     ------
     AddressError
         It names a type that EPypes does not have.
     """
-    return RosMessageCodec(address, options) if "type" in address.options else _message_codec()
+    if "type" in address.options:
+        codec = RosCodec(address, options)
+        return codec, _ros_sample_type(codec.type.name)
+    return (own := _message_codec()), own.sample_type

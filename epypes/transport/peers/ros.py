@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 from epypes.errors import AddressError, MessageError
 from epypes.transport.address import Address
-from epypes.transport.channel import ChannelOptions, Frames
+from epypes.transport.channel import NO_HEADERS, ChannelOptions, Frames
 from epypes.wire import Limits, decode, encode
-from epypes.wire.ros import ros_type
+from epypes.wire.ros import RosType, ros_type
+
+
+def ros_type_of(address: Address) -> RosType:
+    """Return the type of ROS 2 that an address names; AddressError if EPypes has no such type."""
+    try:
+        return ros_type(address.options["type"])
+    except ValueError as error:
+        raise AddressError(str(address), f"{address}: {error}") from error
 
 
 class RosCodec:
-    """Packs and unpacks the messages of one topic.
+    """Packs and unpacks the messages of one topic, which carry neither id nor headers.
 
     Parameters
     ----------
@@ -33,14 +42,11 @@ class RosCodec:
     """
 
     def __init__(self, address: Address, options: ChannelOptions) -> None:
-        try:
-            self.type = ros_type(address.options["type"])
-        except ValueError as error:
-            raise AddressError(str(address), f"{address}: {error}") from error
+        self.type = ros_type_of(address)
         self._token = address.options.get("token", "")
         self._limits = dataclasses.replace(Limits(), total_bytes=options.max_message_bytes)
 
-    def pack(self, frames: Frames) -> memoryview:
+    def pack(self, frames: Frames, id: str, headers: Mapping[str, str]) -> memoryview:  # noqa: A002
         """Return the CDR of the one value of an Envelope that becomes the message.
 
         Raises
@@ -52,8 +58,8 @@ class RosCodec:
             raise MessageError("no envelope", f"An Envelope can be sent as {self.type.name}, a single frame can't.")
         return self.type.from_envelope(decode(frames, self._limits), self._token, self._limits)
 
-    def unpack(self, cdr: bytes | memoryview) -> tuple[Frames, str]:
-        """Return the frames of the Envelope of a message, and its id.
+    def unpack(self, cdr: bytes | memoryview) -> tuple[Frames, str, Mapping[str, str]]:
+        """Return the frames of the Envelope of a message, a new id, and no headers.
 
         Raises
         ------
@@ -61,4 +67,4 @@ class RosCodec:
             The bytes are no such message.
         """
         envelope = self.type.to_envelope(cdr, self._token, self._limits)
-        return encode(envelope, limits=self._limits), envelope.id
+        return encode(envelope, limits=self._limits), envelope.id, NO_HEADERS

@@ -1,8 +1,9 @@
 """Zenoh: messages from peer to peer, or through routers, by eclipse-zenoh as it comes.
 
-``zenoh://127.0.0.1/KEY`` is for the peers of this machine. Each session listens on a free port, and one of them on
-`_MEETING_PORT` too: the others connect to that one, learn from it where the rest are, and connect to all. When it ends,
-another one takes the port. Nothing is sent by multicast, and nothing listens beyond this machine.
+``zenoh://127.0.0.1/KEY`` is for the peers of this machine. Each session listens on a free port. One of them opens a
+second session, which listens on `_MEETING_PORT`: all connect to that one, learn from it where the rest are, and connect
+to these. When it ends, another session takes the port. Nothing is sent by multicast, and nothing listens beyond this
+machine.
 ``zenoh://HOST:PORT/KEY`` connects to a router. On this machine, peers then also find each other through it, and go on
 without it; anywhere else, with a user or encrypted, all goes through the router.
 
@@ -40,6 +41,8 @@ _MOST_BATCHES: Final = 16
 _ROOM_US: Final = 1_000_000
 # A message up to so many times the limit arrives and is counted as rejected; Zenoh drops a larger one.
 _RECEIVED_OVER_LIMIT: Final = 2
+# How often a session tries to take the port where peers meet, which takes 0.4 ms of CPU while another one has it.
+_TAKES_PORT_S: Final = 0.5
 # While nothing is reached.
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 2_000, "period_increase_factor": 2}
 _FOR_EVER_MS: Final = -1
@@ -60,13 +63,16 @@ class ZenohSession(PeerSession):
         self._topic = topic_of(address, options)
         self._session: Any = None
         self._publisher: Any = None
-        # Entities that end with the session.
+        # What `close` undeclares.
         self._declared: list[Any] = []
         # The publishers by their tokens: those that are there, and those of them that have answered.
         self._tokens: set[str] = set()
         self._joined: set[str] = set()
         self._routers: set[str] = set()
         self._changed = threading.Lock()
+        # Keeps the port where peers meet, until the session closes.
+        self._keeper: threading.Thread | None = None
+        self._closing = threading.Event()
         # How many threads Zenoh has started for callbacks, and those that end.
         self._callbacks, self._ended = 0, queue.SimpleQueue[threading.Thread]()
 
@@ -77,6 +83,10 @@ class ZenohSession(PeerSession):
             text = f"{address} can't be sent to: its key stands for several, for its wildcard. Write one key."
             raise AddressError(str(address), text)
         _check_process(address)
+        if not _has_router(address):
+            name = f"epypes peer {address.name}"
+            self._keeper = threading.Thread(target=self._keep_meeting_point, name=name, daemon=True)
+            self._keeper.start()
         try:
             session = self._session = zenoh.open(_config(address, self.options))
             if is_receiver:
@@ -110,6 +120,19 @@ class ZenohSession(PeerSession):
             if topic.answers:
                 self._declared.append(session.declare_queryable(token, self._called(_answer)))
             self._declared.append(session.liveliness().declare_token(token))
+        self._declared.append(self._publisher)
+
+    def _keep_meeting_point(self) -> None:
+        """Listen where the peers of this machine meet, as soon as no other session does.
+
+        Zenoh could try again by itself, but waits for that without end when the session closes.
+        """
+        endpoints = [_endpoint(self.address, _MEETING_PORT)]
+        listen = {"endpoints": endpoints, "timeout_ms": 0, "exit_on_failure": True}
+        while not self._closing.is_set():
+            with contextlib.suppress(zenoh.ZError), zenoh.open(_made({"mode": "peer", "listen": listen})):
+                self._closing.wait()
+            self._closing.wait(_TAKES_PORT_S)
 
     def send(self, frames: Frames, id: str, headers: Mapping[str, str]) -> None:  # noqa: A002
         """Put a message; see `PeerSession.send`."""
@@ -122,8 +145,15 @@ class ZenohSession(PeerSession):
 
     def close(self, timeout_s: float) -> None:
         """Close the session; Zenoh sends first what it has taken. See `PeerSession.close`."""
+        self._closing.set()
+        # First: a session of Zenoh may connect to peers again while it closes; what it has declared stays with them.
+        for declared in self._declared:
+            with contextlib.suppress(zenoh.ZError):
+                declared.undeclare()
         if self._session is not None:
             self._session.close()
+        if self._keeper is not None:
+            self._keeper.join()
         # Freed here, and not by the garbage collector of a forked child, where Zenoh would wait for its threads.
         self._declared.clear()
         # A thread of a callback that is left when the interpreter ends would abort the process.
@@ -230,20 +260,23 @@ def _has_router(address: Address) -> bool:
     return bool(address.port or address.user or address.ca) or not address.is_on_this_machine
 
 
-def _config(address: Address, options: ChannelOptions) -> zenoh.Config:
+def _endpoint(address: Address, port: int) -> str:
     host = f"[{address.host}]" if ":" in address.host else address.host
+    return f"{'tls' if address.ca else 'tcp'}/{host}:{port}"
+
+
+def _config(address: Address, options: ChannelOptions) -> zenoh.Config:
     is_peer = address.is_on_this_machine and not (address.user or address.ca)
-    timeout_ms = int(options.timeout_s * 1000)
+    connect: dict[str, Any] = {"timeout_ms": 0, "exit_on_failure": True, "retry": _RETRY}
+    if not _has_router(address):
+        connect |= {"timeout_ms": _FOR_EVER_MS, "exit_on_failure": False}
     port = address.port or (_ROUTER_PORT if _has_router(address) else _MEETING_PORT)
-    meeting = f"{'tls' if address.ca else 'tcp'}/{host}:{port}"
-    listening = [f"tcp/{host}:0"] if is_peer else []
     settings: dict[str, Any] = {
         "mode": "peer" if is_peer else "client",
-        "scouting/multicast/enabled": False,
         "scouting/delay": _SCOUTING_MS,
-        "connect": {"endpoints": [meeting], "timeout_ms": 0, "exit_on_failure": True, "retry": _RETRY},
-        "listen": {"endpoints": listening},
-        "transport/unicast/open_timeout": timeout_ms,
+        "connect": {"endpoints": [_endpoint(address, port)], **connect},
+        "listen/endpoints": [_endpoint(address, 0)] if is_peer else [],
+        "transport/unicast/open_timeout": int(options.timeout_s * 1000),
         "transport/link/rx/max_message_size": _RECEIVED_OVER_LIMIT * options.max_message_bytes,
         f"transport/link/tx/queue/size/{address.options.get('priority', 'data')}": _MOST_BATCHES,
         "transport/link/tx/queue/congestion_control/drop": {
@@ -251,16 +284,16 @@ def _config(address: Address, options: ChannelOptions) -> zenoh.Config:
             "max_wait_before_drop_fragments": _ROOM_US,
         },
     }
-    if not _has_router(address):
-        settings["connect"] |= {"timeout_ms": _FOR_EVER_MS, "exit_on_failure": False}
-        # Tried once: Zenoh ends no session in bounded time that tries again to listen.
-        settings["listen"] = {"endpoints": [*listening, meeting], "timeout_ms": 0, "exit_on_failure": False}
     if address.user:
         settings["transport/auth/usrpwd"] = {"user": address.user, "password": address.password}
     if address.ca:
         settings["transport/link/tls/root_ca_certificate"] = address.ca
+    return _made(settings)
+
+
+def _made(settings: Mapping[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
-    for name, value in settings.items():
+    for name, value in {"scouting/multicast/enabled": False, **settings}.items():
         config.insert_json5(name, json.dumps(value))
     return config
 

@@ -24,7 +24,7 @@ from zenoh import ext
 from epypes.errors import AddressError
 from epypes.transport.address import Address
 from epypes.transport.brokers.message import IncomingMessage, pack, unpack
-from epypes.transport.channel import NO_HEADERS, ChannelOptions, Frames
+from epypes.transport.channel import ChannelOptions, Frames
 from epypes.transport.peers.ros import RosCodec
 
 _ID: Final = "epypes-id"
@@ -111,13 +111,12 @@ class _RosTopic(ZenohTopic):
 
     def pack(self, frames: Frames, id: str, headers: Mapping[str, str]) -> tuple[bytes, Any]:  # noqa: A002
         """Return the CDR of the message, and its number, its time and the sender as attachment."""
-        cdr = bytes(self._codec.pack(frames))
+        cdr = bytes(self._codec.pack(frames, id, headers))
         return cdr, ext.z_serialize((ext.Int64(next(self._numbers)), ext.Int64(time.time_ns()), self._gid))
 
     def unpack(self, payload: bytes, attachment: Any) -> tuple[Frames, str, Mapping[str, str]]:
         """Return the frames of the Envelope of a message."""
-        frames, known_as = self._codec.unpack(payload)
-        return frames, known_as, NO_HEADERS
+        return self._codec.unpack(payload)
 
 
 def topic_of(address: Address, options: ChannelOptions) -> ZenohTopic:
