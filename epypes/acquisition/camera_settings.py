@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from numbers import Integral, Real
+from textwrap import shorten
 from typing import Any, Final, Literal, Protocol
 
 from epypes.errors import InvalidValue, UnknownName
@@ -84,7 +85,9 @@ class CameraSetting:
         elif self.kind in ("int", "float"):
             low, high = -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
             is_one = is_one and low <= value <= high
-            allowed = f"a{' whole' * (self.kind == 'int')} number from {low:,.12g} to {high:,.12g}{unit}"
+            allowed = (
+                f"a{' whole' * (self.kind == 'int')} number from {round(low, 6):,.12g} to {round(high, 6):,.12g}{unit}"
+            )
         if not is_one:
             raise InvalidValue(f"{self.name} can't be {value!r:.60}. Give {allowed}.")
         if self.kind == "int":
@@ -181,7 +184,7 @@ class CameraSettings(Mapping[str, CameraSetting]):
         return len(tuple(iter(self)))
 
     def __repr__(self) -> str:
-        return f"<CameraSettings: {', '.join(self):.200}>"
+        return f"<CameraSettings: {shorten(', '.join(self), 200, placeholder=' ...')}>"
 
 
 def _write_all(nodes: NodeMap, values: Iterable[tuple[str, Any]]) -> None:

@@ -74,7 +74,8 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
         - the number of a device, or the URL of a stream;
         - the address of a camera with a node map, as ``epypes cameras`` lists them: ``"basler:SERIAL"`` by pylon,
           ``"genicam:SERIAL"`` for any of GigE Vision or USB3 Vision. It has ``settings``, ``trigger()`` and ``counts``:
-          see `DeviceCamera`;
+          see `DeviceCamera`. A device belongs to the camera that opened it, until ``close()``; ``read()`` opens it
+          again. A notebook's cell that is run again closes its former camera, unless something reads it;
         - an opened ``cv2.VideoCapture``, which is yours to release, or a function that returns one, which is called
           again when the device has failed: so you can set what you like on it;
         - an iterable of arrays, an iterator or a generator, or a function that returns one;
@@ -91,7 +92,7 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Itera
     ImageFileError
         A file or folder can't be read.
     CameraUnavailable
-        A device or stream can't be opened, or a camera of this process has the device and is not closed.
+        A device or stream can't be opened, or another camera of this process has the device.
     MissingPackage
         The library of such a camera is not installed.
     TypeError, ValueError

@@ -173,8 +173,10 @@ def _verify_service(bundle: Path, against: str, tolerances: Mapping[str, float],
 
 def _describe_difference(subject: str, report: ReplayReport) -> str:
     """Return in one line what differs, and the likely cause."""
-    tokens = ", ".join(dict.fromkeys(repr(difference.token) for difference in report.differences))
-    found = f"in {counted(len(report.differences), 'place')}, token {tokens}" if tokens else "it has no samples"
+    tokens = list(dict.fromkeys(repr(difference.token) for difference in report.differences))
+    found = "it has no samples"
+    if tokens:
+        found = f"in {counted(len(report.differences), 'place')}, token{'s' * (len(tokens) > 1)} {', '.join(tokens)}"
     cause = f" Likely: {report.causes[0]}" if report.causes else ""
     return f"{subject} does not compute what was recorded: {found}.{cause}"
 

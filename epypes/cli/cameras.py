@@ -39,7 +39,7 @@ def cameras(as_json: bool) -> None:
         ]
         print_table({name: {"overflow": "fold"} for name in ("address", "model", "serial", "at", "state")}, table)
     else:
-        click.echo("No camera was found.")
+        click.echo("No camera was found. With PYLON_CAMEMU=2 before the command, pylon emulates two.")
     for error in missing:
         click.echo(f"Not looked for: {error}")
 

@@ -1,14 +1,14 @@
 """Messages of ROS 2 as the events and answers of a bundle: an address with ``type=`` has one value per message.
 
-A received value gets the name of the bundle's one input. What is published is an output that fits the type, which the
-bundle's samples show before the service starts. A bundle with an f_in or f_out of its own may make anything of a
-message, so that side is left as it is.
+A received value gets the name of the bundle's one input. What is published is an output that fits the type. The
+samples of the bundle show whether both fit, before the service starts. A bundle with an f_in or f_out of its own may
+make anything of a message, so that side is left as it is.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from urllib.parse import quote
 
@@ -19,7 +19,7 @@ from epypes.service.options import Options
 from epypes.transport.address import Address, parse_address
 from epypes.transport.peers.ros import ros_type_of
 from epypes.wire import Envelope
-from epypes.wire.samples import read_sample
+from epypes.wire.samples import Sample, read_sample
 
 
 def with_input_name(options: Options, bundle: BundleInfo) -> Options:
@@ -28,8 +28,8 @@ def with_input_name(options: Options, bundle: BundleInfo) -> Options:
     Raises
     ------
     AddressError
-        The bundle has no input, several or another one; or the address of answers has messages of ROS 2 that can't hold
-        them: its ``token`` is no output, or the outputs of no sample fit.
+        The bundle has no input, several, another one or one of another kind than the messages; or the address of
+        answers has messages of ROS 2 that can't hold them: its ``token`` is no output, or the outputs of no sample fit.
     """
     sub, pub, own = parse_address(options.sub), parse_address(options.pub), bundle.settings.own
     if "type" in pub.options and "f_out" not in own:
@@ -45,27 +45,44 @@ def with_input_name(options: Options, bundle: BundleInfo) -> Options:
         )
         raise AddressError(str(sub), text)
     _check_name(sub, token, inputs, "input")
+    _check_events(sub, bundle)
     return options if token else replace(options, sub=f"{options.sub}&token={quote(inputs[0], safe='')}")
+
+
+def _check_events(sub: Address, bundle: BundleInfo) -> None:
+    ros, (token,) = ros_type_of(sub), bundle.settings.inputs
+
+    def check(sample: Sample) -> None:
+        ros.check_kind(token, sample.inputs[token])
+
+    _check_samples(check, bundle, sub, "can't be the events")
 
 
 def _check_answers(pub: Address, bundle: BundleInfo) -> None:
     token, outputs, rgb = pub.options.get("token", ""), bundle.settings.outputs, bundle.settings.rgb
     ros = ros_type_of(pub)
     _check_name(pub, token, outputs, "output")
+
+    def check(sample: Sample) -> None:
+        parts = {name: sample.outputs[name] for name in outputs if name in sample.outputs}
+        ros.from_envelope(Envelope("answer", parts, rgb=[name for name in rgb if name in parts]), token)
+
+    _check_samples(check, bundle, pub, "can't publish the answers")
+
+
+def _check_samples(check: Callable[[Sample], object], bundle: BundleInfo, address: Address, wrong: str) -> None:
+    """Raise AddressError if no sample fits; another one may be without a result."""
     refusal: MessageError | None = None
     for path in sorted((bundle.path / SAMPLES).glob("*.npz")):
-        recorded = read_sample(path).outputs
-        parts = {name: recorded[name] for name in outputs if name in recorded}
         try:
-            ros.from_envelope(Envelope("answer", parts, rgb=[name for name in rgb if name in parts]), token)
+            check(read_sample(path))
         except MessageError as error:
             refusal = refusal or error
         else:
-            # Another sample may be one without a result.
             return
     if refusal is not None:
-        text = f"{pub} can't publish the answers of {bundle.settings.name}, by its samples: {refusal}"
-        raise AddressError(str(pub), text) from refusal
+        text = f"{address} {wrong} of {bundle.settings.name}, by its samples: {refusal}"
+        raise AddressError(str(address), text) from refusal
 
 
 def _check_name(address: Address, token: str, names: Collection[str], kind: str) -> None:

@@ -164,7 +164,7 @@ def read_states(bundle: str | Path, replica: str = "") -> list[ServiceState]:
     found = [_read(file) for file in ([state_file(bundle, replica)] if replica else started)]
     folder = str(Path(bundle).resolve())
     return [state for state in found if state is not None] or [
-        state for state in _running() if state.bundle == folder and replica in ("", state.replica)
+        state for state in running_states() if state.bundle == folder and replica in ("", state.replica)
     ]
 
 
@@ -177,10 +177,10 @@ def _order(file: Path) -> tuple[int, str]:
 def running_at(http: str) -> ServiceState | None:
     """Return the state of this user's service with this HTTP address, or None if there is none."""
     wanted = http.rstrip("/")
-    return next((state for state in _running() if state.http.rstrip("/") == wanted), None)
+    return next((state for state in running_states() if state.http.rstrip("/") == wanted), None)
 
 
-def _running() -> Iterator[ServiceState]:
+def running_states() -> Iterator[ServiceState]:
     """Yield the states of all running services of this user."""
     for file in sorted(_folder().glob("*.json")):
         if (state := _read(file)) is not None:

@@ -160,6 +160,16 @@ class RosType:
         self._check_size(cdr, limits)
         return cdr
 
+    def check_kind(self, token: str, value: Any) -> None:
+        """Raise MessageError for a value of another kind than a message of this type; all numbers are one kind."""
+        kinds = _NUMBERS if self.name in _NUMBERS else (self.name,)
+        if not any(_TYPES[kind]._fits(value) for kind in kinds):
+            raise self._wrong_type(token, value)
+
+    def _wrong_type(self, token: str, value: Any) -> MessageError:
+        text = f"{token!r} is {_describe(value)}; a {self.name} must be {self._wanted}."
+        return MessageError("wrong type", text)
+
     @property
     def _has_header(self) -> bool:
         return self.definition.startswith(_HEADER)
@@ -180,8 +190,7 @@ class RosType:
             way_out = f"Did you mean {near[0]!r}?" if near else f"There are: {', '.join(parts) or 'none'}."
             raise MessageError("no such part", f"The message has no part {token!r} to be a {self.name}. {way_out}")
         if token and not self._fits(parts[token]):
-            text = f"{token!r} is {_describe(parts[token])}; a {self.name} must be {self._wanted}."
-            raise MessageError("wrong type", text)
+            raise self._wrong_type(token, parts[token])
         fitting = [token] if token else [name for name, value in parts.items() if self._fits(value)]
         if len(fitting) > 1:
             text = f"Each of {', '.join(map(repr, fitting))} could be the {self.name}."
@@ -220,7 +229,7 @@ def ros_type(name: str) -> RosType:
     package, _, rest = plain.partition("/")
     found = _TYPES.get(f"{package}/msg/{rest.removeprefix('msg/')}")
     if found is None:
-        near = difflib.get_close_matches(plain, _TYPES, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(plain, _TYPES, n=1, cutoff=0.8)
         way_out = f"Did you mean {near[0]!r}?" if near else f"There are: {', '.join(_TYPES)}."
         raise InvalidValue(f"No type {name!r} among those of ROS 2's messages that EPypes has. {way_out}")
     return found
@@ -342,6 +351,7 @@ def _is_a(kind: type, of_numpy: str) -> Callable[[Any], bool]:
 
 
 _is_integer: Final = _is_a(int, "iu")
+_NUMBERS: Final = ("std_msgs/msg/Bool", "std_msgs/msg/Int64", "std_msgs/msg/Float64")
 _TYPES: Final[Mapping[str, RosType]] = {
     each.name: each
     for each in (

@@ -11,7 +11,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import AddressError, ServiceError
-from epypes.service import Service, call
+from epypes.service import Client, Service, call
 from epypes.wire import Envelope
 from tests.service.bundles import written_bundle
 from tests.service.processes import running
@@ -39,12 +39,19 @@ def test_a_service_without_a_broker_answers_fails_drains_and_goes_on(middleware,
         until(lambda: service.counts()["answered"] == 2)
         counts = service.counts()
         assert (counts["received"], counts["failed"], counts["lost"]) == (3, 1, 0)
+        wrong = {name: f"{names[name]}x" for name in ("sub", "pub")}
+        text = f"Nothing publishes to {wrong['pub']}. Nothing subscribes to {wrong['sub']}. The addresses must be those"
+        with pytest.raises(ServiceError, match=text), Client(acting, **wrong, timeout_s=0.1):
+            pass
 
 
 @pytest.mark.parametrize("middleware", PEERS)
 def test_a_service_takes_raw_images_of_ros_2_and_publishes_edges(middleware, edge_bundle, photograph):
     number = uuid4().hex
-    place = {name: f"{OfPeers(middleware).address(f'rt/{name}_{number}')}?type=sensor_msgs/msg/Image" for name in "ab"}
+    before = "rt/" if middleware == "dds" else ""
+    place = {
+        name: f"{OfPeers(middleware).address(f'{before}{name}_{number}')}?type=sensor_msgs/msg/Image" for name in "ab"
+    }
     edges, images = queue.Queue(), ep.Mailbox("block")
     expected = cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200)
     with (
@@ -63,6 +70,8 @@ def test_a_service_takes_raw_images_of_ros_2_and_publishes_edges(middleware, edg
             assert np.array_equal(answer.parts["edges"], expected)
         with pytest.raises(ServiceError, match="do not say which event an answer is to"):
             call(edge_bundle.path, {"image": photograph})
+        with pytest.raises(ServiceError, match="do not say which event an answer is to"):
+            Client(edge_bundle.path, sub=place["a"], pub=place["b"])
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +127,7 @@ def test_a_message_of_ros_2_gets_the_name_of_the_input_and_an_answer_that_is_non
             "by its samples: A std_msgs/msg/Int64 must be a whole number",
         ),
         ("small", {"sub": f"dds://7/rt/a?{IMAGE}&token=image"}, "no input 'image'. Write token=picture"),
+        ("small", {"sub": f"dds://7/rt/a?{NUMBER}"}, "by its samples: 'picture' is uint8 2 x 4 x 3; .* a whole number"),
         ("acting", {"sub": f"dds://7/rt/a?{NUMBER}"}, "one value, and an event of acting has 'what', 'number'"),
     ],
 )

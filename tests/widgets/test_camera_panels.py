@@ -164,6 +164,8 @@ def test_what_can_not_be_shown_is_refused_with_a_way_out(camera):
         tune(runner_of(both), camera=camera)
     with pytest.raises(UnknownName, match="No setting 'GainRaw' of this camera"):
         tune(runner_of(level), camera=Counting(), GainRaw=(0, 3))
+    with pytest.raises(UnknownName, match="No setting or hyperparameter 'ExposureTme'.*Did you mean 'ExposureTime'"):
+        tune(runner_of(level), camera=camera, ExposureTme=(100, 200))
     with pytest.raises(ValueError, match="hint .* of the setting 'Width' does not fit its value, 64") as info:
         tune(runner_of(level), camera=camera, Width=(100, 200))
     assert "closed" in repr(camera)

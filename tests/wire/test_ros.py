@@ -105,6 +105,8 @@ def test_types_are_those_of_ros_2s_packages(published):
     assert ros_type("sensor_msgs::msg::dds_::Image_") is ros_type("sensor_msgs/Image") is IMAGE
     with pytest.raises(ValueError, match=r"'sensor_msgs/Imag'.*Did you mean 'sensor_msgs/msg/Image'\?"):
         ros_type("sensor_msgs/Imag")
+    with pytest.raises(ValueError, match=r"'geometry_msgs/msg/Pose'.*There are: sensor_msgs/msg/Image, "):
+        ros_type("geometry_msgs/msg/Pose")
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from epypes.transport.address import parse_address
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
+    from epypes.transport.address import Address
     from epypes.transport.zeromq.curve import PublicKey
     from epypes.wire import Envelope
 
@@ -42,6 +43,10 @@ class Answer:
         The run's time in the service, and the graph's part of it; None if an f_out of the bundle's own leaves them out.
     round_trip_ns
         From sending to receiving, on the caller's clock.
+    revision
+        Of the hyperparameters that it was computed with: how often they were changed.
+    bundle_digest
+        Of the bundle that the service serves.
     """
 
     tokens: Mapping[str, Any]
@@ -49,6 +54,8 @@ class Answer:
     total_ns: int | None
     overhead_ns: int | None
     round_trip_ns: int
+    revision: int
+    bundle_digest: str
 
 
 class Client:
@@ -101,6 +108,9 @@ class Client:
                 text = f"{missing} (--{missing}) is missing: give both addresses of a service that has no state here."
                 raise ServiceError(path, f"{error} {text}") from None
             sub, pub = sub or state.sub, pub or state.pub
+        self._sub, self._pub = parse_address(sub), parse_address(pub)
+        _check_answerable(path, self._sub)
+        _check_answerable(path, self._pub)
         self._rgb = read_settings(Path(path) / SETTINGS).rgb
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -115,7 +125,7 @@ class Client:
             is_heard = self._subscriber.wait_joined(self.timeout_s)
             if not (is_heard and self._publisher.wait_for_subscriber(max(deadline - monotonic(), 0.0))):
                 text = f"The service of {self.path} can't be reached within {self.timeout_s:g} s."
-                raise ServiceError(self.path, f"{text} {why_unreachable(self._has_keys)}")
+                raise ServiceError(self.path, f"{text} {self._why_unreachable(is_heard)}")
         except BaseException:
             self.__exit__()
             raise
@@ -124,6 +134,20 @@ class Client:
     def __exit__(self, *exception: object) -> None:
         self._publisher.stop()
         self._subscriber.stop()
+
+    def _why_unreachable(self, is_heard: bool) -> str:
+        is_sent = self._publisher.wait_for_subscriber(0.0)
+        sides = (is_heard, "publishes", self._pub), (is_sent, "subscribes", self._sub)
+        missing = [(verb, address) for is_there, verb, address in sides if not is_there]
+        if any(address.is_zeromq for _, address in missing):
+            return why_unreachable(self._has_keys)
+        texts = [
+            f"There is no connection to the broker of {address}."
+            if address.is_broker
+            else f"Nothing {verb} to {address}."
+            for verb, address in missing
+        ]
+        return " ".join([*texts, "The addresses must be those that epypes serve was given."])
 
     def _lost(self) -> int:
         return sum(self._subscriber.lost.values())
@@ -204,17 +228,21 @@ def _running(path: str | Path) -> ServiceState:
     if state is None:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     for address in (state.sub, state.pub):
-        if "type" in parse_address(address).options:
-            text = (
-                f"The service of {path} has messages of ROS 2 at {address}. They do not say which event an answer is "
-                "to: send the event with ep.Publisher, and read the answers with ep.Subscriber."
-            )
-            raise ServiceError(path, text)
         # The address of a broker has no such prefix: service and callers connect to it alike.
         if address.startswith("connect:"):
             text = f"The service of {path} connects to {address.removeprefix('connect:')}; send your events there."
             raise ServiceError(path, text)
     return state
+
+
+def _check_answerable(path: str | Path, address: Address) -> None:
+    """Raise ServiceError for an address whose messages do not say which event an answer is to."""
+    if "type" in address.options:
+        text = (
+            f"The service of {path} has messages of ROS 2 at {address}. They do not say which event an answer is to: "
+            "send the event with ep.Publisher, and read the answers with ep.Subscriber."
+        )
+        raise ServiceError(path, text)
 
 
 def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber:
@@ -240,4 +268,6 @@ def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collectio
         answer.attributes.get("total_ns"),
         answer.attributes.get("overhead_ns"),
         round_trip_ns,
+        answer.revision,
+        answer.bundle_digest,
     )

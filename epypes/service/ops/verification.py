@@ -6,6 +6,7 @@ The service may run anywhere and be in any language. No code of the bundle is ex
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -15,13 +16,18 @@ from epypes.bundle.proof.compare import Difference, difference, differences
 from epypes.bundle.proof.replay import ReplayReport
 from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError, ReplayDiffers, ServiceError, UnknownName
-from epypes.service.ops.client import Client
+from epypes.service.ops.client import Answer, Client
+from epypes.service.parameters import entries_of
+from epypes.service.remote.connection import connect
+from epypes.service.state_file import running_states
 from epypes.transport.address import parse_address
 from epypes.wire.samples import read_sample
 
 if TYPE_CHECKING:
     from epypes.bundle.settings import Settings
 
+# Of a digest, as commands print it.
+_DIGITS: Final = 12
 _NO_TOLERANCES: Final[Mapping[str, float]] = MappingProxyType({})
 
 
@@ -55,7 +61,7 @@ def verify_service(
         A function failed on a sample.
     """
     folder = Path(path).resolve()
-    check_manifest(folder)
+    bundle_digest = check_manifest(folder)
     settings = read_settings(folder / SETTINGS)
     for token in tolerances:
         if token not in settings.outputs:
@@ -64,14 +70,17 @@ def verify_service(
     samples = sorted((folder / SAMPLES).glob("*.npz"))
     found: list[Difference] = []
     within: dict[str, float] = {}
+    causes: list[str] = []
     with Client(path, sub=sub, pub=pub, **options) as client:
         for file in samples:
             sample = read_sample(file)
-            tokens = client.call(sample.inputs).tokens
+            answer = client.call(sample.inputs)
+            tokens = answer.tokens
+            causes = _causes(path, bundle_digest, settings, answer, pub)
             if tokens.keys() != sample.outputs.keys():
                 answered, recorded = (", ".join(names) or "nothing" for names in (tokens, sample.outputs))
                 text = f"The service at {parse_address(sub)} answers with {answered}, and {path} has recorded"
-                raise ServiceError(path, f"{text} {recorded}. Does it serve this bundle?")
+                raise ServiceError(path, " ".join([f"{text} {recorded}.", *(causes or ["Does it serve this bundle?"])]))
             for token, expected in sample.outputs.items():
                 places = [*differences(expected, tokens[token], settings.tolerances.get(token))]
                 accepted = [each for each in places if _is_within(each, tolerances.get(token))]
@@ -86,12 +95,42 @@ def verify_service(
     count = len(samples) * len(settings.outputs)
     report = ReplayReport(len(samples), count, tuple(found), environment=environment(), notes=notes)
     if not report.identical:
-        raise ReplayDiffers(path, report)
+        raise ReplayDiffers(path, replace(report, causes=causes))
     return report
 
 
 def _is_within(found: Difference, tolerance: float | None) -> bool:
     return tolerance is not None and found.largest is not None and found.largest <= tolerance
+
+
+def _causes(path: str | Path, bundle_digest: str, settings: Settings, answer: Answer, pub: str) -> list[str]:
+    """Return why the answers of a service may differ from the samples: another bundle, or changed hyperparameters."""
+    found = []
+    if answer.bundle_digest not in ("", bundle_digest):
+        served, here = answer.bundle_digest[:_DIGITS], bundle_digest[:_DIGITS]
+        found.append(f"The service serves another bundle ({served}); {path} is {here}.")
+    if answer.revision:
+        changed = _changed_values(settings, pub)
+        text = f"The service is at revision {answer.revision} of its hyperparameters"
+        found.append(f"{text}: {', '.join(changed)}." if changed else f"{text}, and the samples were recorded at 0.")
+    return found
+
+
+def _changed_values(settings: Settings, pub: str) -> list[str]:
+    """Return the values in which a service of this user differs from the bundle; none without its HTTP address."""
+    url = next((state.http for state in running_states() if state.pub == pub), "")
+    if not url:
+        return []
+    try:
+        with connect(url) as connection:
+            now = connection.parameters().entries
+    except ServiceError:
+        return []
+    return [
+        f"{name} is {now[name]['value']!r:.60}, in the bundle {entry['value']!r:.60}"
+        for name, entry in entries_of(settings).items()
+        if name in now and now[name]["value"] != entry["value"]
+    ]
 
 
 def _check_sendable(folder: Path, settings: Settings) -> None:

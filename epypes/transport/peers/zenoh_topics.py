@@ -88,6 +88,9 @@ class _RosTopic(ZenohTopic):
         name = address.name.strip("/")
         if not re.fullmatch(r"[\w/]+", name, re.ASCII):
             raise AddressError(str(address), f"{name!r} is no name of a ROS 2 topic, in {address}. Write camera/image.")
+        if name.startswith("rt/"):
+            text = f"{address}: in Zenoh, a topic of ROS 2 has no rt/ before its name"
+            raise AddressError(str(address), f"{text}: write zenoh://{address.host}/{name.removeprefix('rt/')}")
         kind = self._codec.type
         self.key = _checked_key(address, f"{self._domain}/{name}/{kind.dds_name}/{kind.rihs01}")
         self.keys = f"{self._domain}/{name}/{kind.dds_name}/*"

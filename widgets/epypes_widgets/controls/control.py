@@ -512,11 +512,12 @@ def controls(
     UnknownName, TypeError, ValueError
         A hint is for no hyperparameter, can't be read, or does not fit: see ``ranges``.
     """
-    values, first, params = runner.hyperparameters, runner.first_hyperparameters, ranges(runner, hints)
+    settings = settings or {}
+    values, first, params = runner.hyperparameters, runner.first_hyperparameters, ranges(runner, hints, settings)
     pairs = {along.name: pair for pair in _pairs(params, values) for along in pair}
     appearance = Appearance(runner.cg)
     made: dict[str, Control] = {}
-    for name, (value, setting) in (settings or {}).items():
+    for name, (value, setting) in settings.items():
         made[name] = _single(name, value, setting, value, tooltip(runner.cg, name, setting), appearance)
         made[name].tip = tooltip(runner.cg, name, setting)
     for token, param in params.items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -29,7 +29,7 @@ _UPPER: Final = {"lo": "hi", "low": "high", "min": "max", "lower": "upper", "min
 _NUMBERED: Final = frozenset(("threshold", "thresh"))
 
 
-def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
+def ranges(runner: Tunable, hints: Mapping[str, Any], settings: Collection[str] = ()) -> dict[str, Range]:
     """Return the range of every hyperparameter, in graph order; None for one that can only be shown.
 
     Parameters
@@ -38,6 +38,8 @@ def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
         Its hyperparameters and their values are read.
     hints
         By token: a Param or Roi, a tuple as a range, a list as choices.
+    settings
+        The names of a camera's settings, for the error about a name that is unknown.
 
     Returns
     -------
@@ -57,7 +59,8 @@ def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
     values = runner.hyperparameters
     for name in hints:
         if name not in values:
-            raise UnknownName("hyperparameter", name, values, "of this runner")
+            kind, of = ("setting or hyperparameter", "camera or ") if settings else ("hyperparameter", "")
+            raise UnknownName(kind, name, [*settings, *values], f"of this {of}runner")
     return _ranges(runner, {name: _read(runner, name, hint) for name, hint in hints.items()})
 
 
