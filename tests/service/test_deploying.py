@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 import signal
 
@@ -95,6 +96,12 @@ def test_a_service_is_found_by_the_bundle_it_was_started_with_and_by_the_one_tha
             assert epypes("status", bundle).stdout.startswith(f"READY {better}")
             answered = epypes("call", bundle, 'what="plain"', "number=5")
             assert answered.stdout.startswith("out = 15"), answered.stderr
+        assert epypes("verify", better, "--against", better).returncode == 0
+        assert epypes("set", better, "k=5").returncode == 0
+        changed = epypes("verify", better, "--against", better).stderr
+        assert re.search(r"in 1 place, token 'out'\. Likely: .* at revision \d+: k is 5, in the bundle 3\.", changed)
+        other = epypes("verify", acting, "--against", acting).stderr
+        assert f"Likely: The service serves another bundle ({check_manifest(better)[:12]})" in other
 
 
 def test_the_child_of_a_function_that_forks_does_not_go_on_as_a_worker(tmp_path):

@@ -109,23 +109,24 @@ def _causes(path: str | Path, bundle_digest: str, settings: Settings, answer: An
     if answer.bundle_digest not in ("", bundle_digest):
         served, here = answer.bundle_digest[:_DIGITS], bundle_digest[:_DIGITS]
         found.append(f"The service serves another bundle ({served}); {path} is {here}.")
-    if answer.revision:
-        changed = _changed_values(settings, pub)
-        text = f"The service is at revision {answer.revision} of its hyperparameters"
-        found.append(f"{text}: {', '.join(changed)}." if changed else f"{text}, and the samples were recorded at 0.")
+    changed = _changed_values(settings, pub) if answer.revision else []
+    if changed is None:
+        found.append(f"The service is at revision {answer.revision}: its hyperparameters may have been changed.")
+    elif changed:
+        found.append(f"The service is at revision {answer.revision}: {', '.join(changed)}.")
     return found
 
 
-def _changed_values(settings: Settings, pub: str) -> list[str]:
-    """Return the values in which a service of this user differs from the bundle; none without its HTTP address."""
+def _changed_values(settings: Settings, pub: str) -> list[str] | None:
+    """Return the values in which a service of this user differs from the bundle; None without its HTTP control."""
     url = next((state.http for state in running_states() if state.pub == pub), "")
     if not url:
-        return []
+        return None
     try:
         with connect(url) as connection:
             now = connection.parameters().entries
     except ServiceError:
-        return []
+        return None
     return [
         f"{name} is {now[name]['value']!r:.60}, in the bundle {entry['value']!r:.60}"
         for name, entry in entries_of(settings).items()
