@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Integral, Real
 from textwrap import shorten
 from typing import Any, Final, Literal, Protocol
@@ -111,6 +111,30 @@ class NodeMap(Protocol):
         """Run a command, such as ``TriggerSoftware``; UnknownName if there is none of this name."""
 
 
+@dataclass(slots=True)
+class SettingsMemory:
+    """What was set on a camera, to be set again when it is opened anew."""
+
+    # By the selectors that were set before, since ``TriggerMode`` is another one for each ``TriggerSelector``.
+    written: dict[tuple[tuple[tuple[str, str], ...], str], Any] = field(default_factory=dict)
+    selected: dict[str, str] = field(default_factory=dict)
+
+    def note(self, name: str, value: Any) -> None:
+        """Keep what was set."""
+        if name.endswith("Selector"):
+            self.selected[name] = value
+            return
+        key = tuple(sorted(self.selected.items())), name
+        self.written.pop(key, None)  # what is set last is restored last
+        self.written[key] = value
+
+    def restore(self, nodes: NodeMap) -> None:
+        """Set on a camera that was opened anew what was set before; what it refuses now is logged."""
+        for (selected, name), value in self.written.items():
+            _write_all(nodes, (*selected, (name, value)))
+        _write_all(nodes, self.selected.items())
+
+
 class CameraSettings(Mapping[str, CameraSetting]):
     """The settings of a camera: ``settings["ExposureTime"]`` reads one, ``settings["ExposureTime"] = 20_000`` sets it.
 
@@ -123,17 +147,17 @@ class CameraSettings(Mapping[str, CameraSetting]):
         A context that has the camera's node map; CameraUnavailable if it can't be opened.
     stopped
         The same, in which the camera stands still.
+    memory
+        Takes what is set.
     """
 
     def __init__(
         self,
         opened: Callable[[], AbstractContextManager[NodeMap]],
         stopped: Callable[[], AbstractContextManager[NodeMap]],
+        memory: SettingsMemory,
     ) -> None:
-        self._opened, self._stopped = opened, stopped
-        # By the selectors that were set before, since ``TriggerMode`` is another one for each ``TriggerSelector``.
-        self._written: dict[tuple[tuple[tuple[str, str], ...], str], Any] = {}
-        self._selected: dict[str, str] = {}
+        self._opened, self._stopped, self._memory = opened, stopped, memory
 
     def __getitem__(self, name: str) -> CameraSetting:
         with self._opened() as nodes:
@@ -159,21 +183,10 @@ class CameraSettings(Mapping[str, CameraSetting]):
         with self._opened() as nodes:
             nodes.execute(command)
 
-    def restore(self, nodes: NodeMap) -> None:
-        """Set on a camera that was opened anew what was set before; what it refuses now is logged."""
-        for (selected, name), value in self._written.items():
-            _write_all(nodes, (*selected, (name, value)))
-        _write_all(nodes, self._selected.items())
-
     def _write(self, nodes: NodeMap, found: CameraSetting, value: Any) -> None:
         checked = found.require(value)
         nodes.write(found.name, checked)
-        if found.name.endswith("Selector"):
-            self._selected[found.name] = checked
-            return
-        key = tuple(sorted(self._selected.items())), found.name
-        self._written.pop(key, None)  # what is set last is restored last
-        self._written[key] = checked
+        self._memory.note(found.name, checked)
 
     def __iter__(self) -> Iterator[str]:
         with self._opened() as nodes:

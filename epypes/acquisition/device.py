@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final, Protocol, Self
 
-from epypes.acquisition.camera_settings import CameraSettings, NodeMap
+from epypes.acquisition.camera_settings import CameraSettings, NodeMap, SettingsMemory
 from epypes.acquisition.device_owner import DeviceOwner
 from epypes.acquisition.frames import Frame, FrameCamera, next_due_s
 from epypes.errors import CameraUnavailable, MissingPackage
@@ -160,8 +160,6 @@ class DeviceCamera(DeviceOwner, FrameCamera):
     ----------
     address
         As it was given.
-    settings
-        Exposure, gain, trigger, pixel format, region and all others, by the camera's own names.
 
     Parameters
     ----------
@@ -186,9 +184,15 @@ class DeviceCamera(DeviceOwner, FrameCamera):
         self._turn, self._stream, self._lock = threading.RLock(), threading.RLock(), threading.RLock()
         self._reader: int | None = None
         self._finalizer: Any = None
-        self.settings = CameraSettings(self._opened, self._stopped)
+        self._memory = SettingsMemory()
         with self._opened():
             pass
+
+    @property
+    def settings(self) -> CameraSettings:
+        """Exposure, gain, trigger, pixel format, region and all others, by the camera's own names."""
+        # Were it kept, it and the camera would refer to each other, and a dropped camera would keep its device.
+        return CameraSettings(self._opened, self._stopped, self._memory)
 
     @property
     def counts(self) -> DeviceCounts:
@@ -323,7 +327,7 @@ class DeviceCamera(DeviceOwner, FrameCamera):
                 raise CameraUnavailable(self.address, text)
             device = self._backend.open(found)
             undone.callback(device.close)
-            self.settings.restore(device)
+            self._memory.restore(device)
             undone.pop_all()
         # A camera that is dropped without `close` lets go of its device, too.
         self._finalizer = weakref.finalize(self, device.close)

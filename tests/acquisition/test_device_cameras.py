@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 import os
 import queue
@@ -340,7 +339,6 @@ def test_a_cell_that_is_run_again_has_its_camera_again(emulated):
 def test_a_camera_that_is_dropped_is_closed(fake):
     for address in (BASLER, GENICAM):
         ep.camera(address).read()
-        gc.collect()
         assert [found.is_free for found in find_cameras()[0] if found.address == address] == [True]
 
 
