@@ -112,8 +112,10 @@ def _token_type(bundle: Bundle, token: str, values: Sequence[Any], is_hyperparam
         kind = functools.reduce(join, map(type_of, values))
     except TypeError as error:
         maker = bundle.cg.digraph.producer.get(token)
+        takers = [repr(name) for name in bundle.cg.functions if token in bundle.cg.func_inputs(name)]
+        merged = f"merge it with {' and '.join(takers)}, or " if takers else ""
         text = f"The values of token {token!r} are {error}, for which C++ has no type. " + (
-            f"Leave it out of the outputs, or have {maker!r} return a tuple of arrays, numbers or lists."
+            f"Let {maker!r} return a tuple of arrays, numbers or lists, {merged}make the graph without it."
             if maker
             else "Give arrays, numbers or lists."
         )

@@ -127,11 +127,22 @@ def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
     def sizes(image):
         return {"height": image.shape[0]}
 
+    def half(found):
+        return found["height"] // 2
+
     runner = ep.CompGraphRunner(ep.CompGraph({"sizes": sizes}, {"sizes": ("image", "found")}))
     runner.run(image=photograph(3))
     with pytest.raises(BundleError, match="token 'found' are a dict") as refused:
         ep.export_cpp(runner, tmp_path / "cpp")
-    assert "Leave it out of the outputs, or have 'sizes' return a tuple" in str(refused.value)
+    way_out = "Let 'sizes' return a tuple of arrays, numbers or lists, {}make the graph without it."
+    assert way_out.format("") in str(refused.value)
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"sizes": sizes, "half": half}, {"sizes": ("image", "found"), "half": ("found", "middle")})
+    )
+    runner.run(image=photograph(3))
+    with pytest.raises(BundleError) as refused:
+        ep.export_cpp(runner, tmp_path / "cpp", outputs=["middle"])
+    assert way_out.format("merge it with 'half', or ") in str(refused.value)
     # The frames are those of the caller and of the exporting module, none below.
     assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
 
