@@ -186,15 +186,27 @@ def test_numpy_1_is_refused(bundle, tmp_path, monkeypatch):
         ep.export_cpp(bundle, tmp_path / "cpp")
 
 
-def test_a_function_by_hand_whose_signature_has_changed_is_named(bundle, tmp_path):
+def test_a_function_by_hand_whose_signature_or_namespace_has_changed_is_named(bundle, tmp_path):
     by_hand = ep.export_cpp(bundle, tmp_path / "cpp").path / "by_hand.cpp"
-    head = '#include "graph.hpp"\nnamespace spots {\n'
-    by_hand.write_text(f"{head}double middle(const cv::Mat &image) {{ return image.rows; }}\n}}\n")
-    assert "signature of" not in str(ep.export_cpp(bundle, tmp_path / "cpp"))
+    start = '#include "graph.hpp"\nnamespace helpers { const char* brace = "{"; }\n'
+    head = f"{start}namespace spots {{\n"
+    own = "double middle(const cv::Mat &image) { return image.rows; }\n"
+    for text in (f"{head}{own}}}\n", f"{start}{own.replace('middle', 'spots::middle')}"):
+        by_hand.write_text(text)
+        printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
+        assert "middle                written in by_hand.cpp: np.median has no translation, in: return" in printed
+    # As after the bundle was renamed.
+    for text, was in ((f"{start}namespace dots {{\n{own}}}\n", "dots"), (f"{start}{own}", "none")):
+        by_hand.write_text(text)
+        assert f"namespace of middle has changed: was {was}, is spots" in str(ep.export_cpp(bundle, tmp_path / "cpp"))
+        assert by_hand.read_text() == text
     by_hand.write_text(f"{head}double middle(const cv::Mat &image, int size) {{ return image.rows; }}\n}}\n")
     was, now = "double middle(const cv::Mat &image, int size)", "double middle(const cv::Mat& blurred)"
     printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
     assert f"signature of middle has changed: was {was}, is {now}" in printed
+    by_hand.write_text(f"{head}cv::Mat gray(const cv::Mat& image) {{ return image; }}\n}}\n")
+    printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
+    assert "it stands in by_hand.cpp: delete it there to have it translated" in printed
 
 
 @pytest.mark.slow
