@@ -40,12 +40,15 @@ class Recording:
         The values of all tokens by sample; a state between runs is under the name of the delayed token.
     functions
         The names of the functions in C++, in run order.
+    opencv_version
+        The version of OpenCV that has run the samples; "" if none is installed.
     """
 
     bundle: Bundle
     tokens: Mapping[str, TokenType]
     runs: Mapping[str, Mapping[str, Any]]
     functions: Mapping[str, str]
+    opencv_version: str
 
     @property
     def hyperparameters(self) -> Sequence[TokenType]:
@@ -104,7 +107,11 @@ def record(path: str | Path) -> Recording:
     }
     names = identifiers(cg.tokens, _TAKEN)
     tokens = {token: TokenType(token, names[token], types[token]) for token in cg.tokens}
-    return Recording(bundle, tokens, runs, identifiers(cg.functions, _TAKEN))
+    try:
+        from cv2 import __version__ as opencv_version
+    except ImportError:
+        opencv_version = ""
+    return Recording(bundle, tokens, runs, identifiers(cg.functions, _TAKEN), opencv_version)
 
 
 def _token_type(bundle: Bundle, token: str, values: Sequence[Any], is_hyperparameter: bool) -> Type:

@@ -127,6 +127,7 @@ def _values(project: Project, is_served: bool) -> dict[str, Any]:
         "ns": namespace_of(project),
         "by_hand": BY_HAND,
         "epypes_version": __version__,
+        "opencv_version": recording.opencv_version,
         "is_served": is_served,
         "recording": recording,
         "settings": settings,

@@ -195,6 +195,11 @@ int run(int count, char** arguments) {
         std::cerr << "\n";
         return 2;
     }
+{% if opencv_version %}
+    if (report.failed != 0) {
+        std::cout << "recorded with OpenCV @{opencv_version}, this is OpenCV " << CV_VERSION << "\n";
+    }
+{% endif %}
     return report.failed == 0 ? 0 : 1;
 }
 
