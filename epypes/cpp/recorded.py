@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, Final
 
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.cpp.scope import ByHand
@@ -24,6 +24,8 @@ from epypes.wire.samples import read_sample
 _TAKEN = tuple(
     "h inputs outputs begin first owned whole_graph Graph Hyperparameters Inputs Outputs State Clock".split()  # noqa: SIM905
 )
+# The longest line of a captured value that a comment shows.
+_MOST_SHOWN: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +163,19 @@ class Source:
 def plain_function(function: Callable[..., Any]) -> FunctionType | None:
     """Return the function of Python that a function of a graph is; None if it is something else."""
     return function if isinstance(function, FunctionType) and not hasattr(function, "__wrapped__") else None
+
+
+def shown_source(function: Callable[..., Any]) -> str:
+    """Return the source of a function, with the short values that it has captured as comments; "" if it has none."""
+    try:
+        text = textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError):
+        return ""
+    captured = inspect.getclosurevars(function).nonlocals if isinstance(function, FunctionType) else {}
+    lines = [f"# {name} = {value!r}" for name, value in captured.items()]
+    # An address would differ at each export.
+    shown = [line for line in lines if len(line) <= _MOST_SHOWN and "\n" not in line and " at 0x" not in line]
+    return "\n".join([*shown, text])
 
 
 def source_of(function: FunctionType) -> Source:

@@ -147,6 +147,21 @@ def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
     assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
 
 
+def test_a_closure_by_hand_has_its_source_and_what_it_has_captured(tmp_path):
+    def above_level(level, table):
+        def chosen(image):
+            return image[image > level], table[:1]
+
+        return chosen
+
+    chosen = above_level(7, np.zeros(200))
+    runner = ep.CompGraphRunner(ep.CompGraph({"chosen": chosen}, {"chosen": ("image", ("pixels", "first"))}))
+    runner.run(image=photograph(3))
+    text = (ep.export_cpp(runner, tmp_path / "cpp").path / "by_hand.cpp").read_text()
+    source = "# level = 7\ndef chosen(image):\n    return image[image > level], table[:1]\n"
+    assert "".join(f"//     {line}\n" for line in source.splitlines()) in text
+
+
 def test_a_state_that_begins_with_an_array_brings_the_header_of_arrays(tmp_path):
     def mixed(image, before):
         return cv2.addWeighted(image, 0.5, before, 0.5, 0)
