@@ -33,9 +33,9 @@ def above(pixels, level):
     return pixels > level + LEVEL
 
 
-def bright(blurred, level=100):
+def bright(blurred, level=100, white=255):
     mask = above(blurred, level)
-    return np.uint8(mask) * 255
+    return np.uint8(mask) * white
 
 
 @ep.outputs("area", "rows")
@@ -230,6 +230,11 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
     shutil.copytree(project, folder)
     done = built(folder)
     assert done.returncode == 1
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), photograph(12))
+    refused = run(folder, "spots", photo)
+    text = "middle: middle is still to be written by hand: see by_hand.cpp\n"
+    assert (refused.returncode, refused.stderr) == (1, text)
     lines = done.stdout.splitlines()
     assert "sample 002, steady, steady: bit-identical" in lines
     assert "sample 000, middle, middle is still to be written by hand: see by_hand.cpp" in lines
@@ -270,15 +275,20 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
     # Command lines are refused with what there is.
     refused = run(folder, "replay", "--tolerance", "brigth=1")
     assert (refused.returncode, "there are gray, blurred, bright, area, rows" in refused.stderr) == (2, True)
-    photo = tmp_path / "photo.png"
-    for program, *options in (("replay", "--quick", "1"), ("spots", photo, "--levle", "1"), ("spots", photo, photo)):
+    for text, program, *options in (
+        ("there is no option --quick", "replay", "--quick", "1"),
+        ("there is no option --levle", "spots", photo, "--levle"),
+        ("the option --level needs a value", "spots", photo, "--level"),
+        ("there is a second input", "spots", photo, photo),
+    ):
         refused = run(folder, program, *options)
         assert (refused.returncode, f"Usage: {program}" in refused.stderr) == (2, True), refused.stderr
+        assert text in refused.stderr
     for program in ("replay", "spots"):
         assert run(folder, program, "--help").stdout.startswith(f"Usage: {program}")
 
     # The program runs the graph, and refuses a value that is out of its range.
-    cv2.imwrite(str(photo), photograph(12))
+    (tmp_path / "steady.png").touch()  # of an earlier run, in which it was an image
     cv2.imwrite(str(tmp_path / "16 bits.png"), photograph(12).astype(np.uint16) * 256)
     cv2.imwrite(str(tmp_path / "gray.png"), gray(photograph(12)))
     exif = Image.Exif()
@@ -291,8 +301,13 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
         assert shown.returncode == 0, shown.stderr
         expected = bright(blurred(gray(cv2.imread(str(image))), 3), 120)
         assert np.array_equal(cv2.imread(str(tmp_path / "bright.png"), cv2.IMREAD_UNCHANGED), expected), name
+    assert not (tmp_path / "steady.png").exists()
     refused = run(folder, "spots", photo, "--blur_kernel", "4")
     assert (refused.returncode, refused.stderr) == (1, "blur_kernel has to be at least 1 and odd\n")
+    refused = run(folder, "spots", photo, "--white", "256")
+    assert (refused.returncode, refused.stderr) == (1, "bright: integer 256 is out of bounds for uint8\n")
+    refused = run(folder, "spots", photo, "--level", "abc")
+    assert (refused.returncode, refused.stderr) == (1, "--level: 'abc' is no number of this type\n")
 
 
 def run(folder, program, *arguments):
