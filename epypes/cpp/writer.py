@@ -240,8 +240,8 @@ def _write_by_hand(project: Project, path: Path, templates: Environment) -> None
     namespace = namespace_of(project)
     added = []
     for each in project.functions:
-        head = rf"[^;{{}}]*?(?P<space>(?:\w+::)*)\b{each.name}\s*\([^;{{}}]*\)(?=\s*\{{)"
-        definitions = [(_namespace_around(code, found), found[0]) for found in re.finditer(head, code)]
+        pattern = rf"[^;{{}}]*?(?P<space>(?:\w+::)*)\b{each.name}\s*\([^;{{}}]*\)(?=\s*\{{)"
+        definitions = [(_namespace_around(code, found), found[0]) for found in re.finditer(pattern, code)]
         if definitions:
             wanted = _types_of(each.signature)
             spaces = [space for space, head in definitions if _types_of(head) == wanted]
