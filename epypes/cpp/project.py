@@ -11,7 +11,7 @@ from types import FunctionType
 from typing import Any
 
 from epypes.cpp import types as t
-from epypes.cpp.recorded import Recording, Source, plain_function, source_of
+from epypes.cpp.recorded import Recording, Source, plain_function, shown_source, source_of
 from epypes.cpp.scope import ByHand, no_counterpart, refuse
 from epypes.cpp.statements import function as translated_function
 
@@ -91,7 +91,7 @@ class Project:
         is_single = recording.bundle.cg.has_single_output(name)
         wanted = outputs[0].type if is_single else t.TupleType(tuple(each.type for each in outputs))
         parameters = [(each.type.passed, each.name) for each in inputs]
-        made = CppFunction(name, recording.functions[name], wanted.cpp, parameters)
+        made = CppFunction(name, recording.functions[name], wanted.cpp, parameters, source=shown_source(function))
         before = dict(self.called)
         source: Source | None = None
         try:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, Final
 
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.cpp.scope import ByHand
@@ -24,6 +24,8 @@ from epypes.wire.samples import read_sample
 _TAKEN = tuple(
     "h inputs outputs begin first owned whole_graph Graph Hyperparameters Inputs Outputs State Clock".split()  # noqa: SIM905
 )
+# The longest line of a captured value that a comment shows.
+_MOST_SHOWN: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +42,15 @@ class Recording:
         The values of all tokens by sample; a state between runs is under the name of the delayed token.
     functions
         The names of the functions in C++, in run order.
+    opencv_version
+        The version of OpenCV that has run the samples; "" if none is installed.
     """
 
     bundle: Bundle
     tokens: Mapping[str, TokenType]
     runs: Mapping[str, Mapping[str, Any]]
     functions: Mapping[str, str]
+    opencv_version: str
 
     @property
     def hyperparameters(self) -> Sequence[TokenType]:
@@ -104,7 +109,11 @@ def record(path: str | Path) -> Recording:
     }
     names = identifiers(cg.tokens, _TAKEN)
     tokens = {token: TokenType(token, names[token], types[token]) for token in cg.tokens}
-    return Recording(bundle, tokens, runs, identifiers(cg.functions, _TAKEN))
+    try:
+        from cv2 import __version__ as opencv_version
+    except ImportError:
+        opencv_version = ""
+    return Recording(bundle, tokens, runs, identifiers(cg.functions, _TAKEN), opencv_version)
 
 
 def _token_type(bundle: Bundle, token: str, values: Sequence[Any], is_hyperparameter: bool) -> Type:
@@ -112,8 +121,10 @@ def _token_type(bundle: Bundle, token: str, values: Sequence[Any], is_hyperparam
         kind = functools.reduce(join, map(type_of, values))
     except TypeError as error:
         maker = bundle.cg.digraph.producer.get(token)
+        takers = [repr(name) for name in bundle.cg.functions if token in bundle.cg.func_inputs(name)]
+        merged = f"merge it with {' and '.join(takers)}, or " if takers else ""
         text = f"The values of token {token!r} are {error}, for which C++ has no type. " + (
-            f"Leave it out of the outputs, or have {maker!r} return a tuple of arrays, numbers or lists."
+            f"Let {maker!r} return a tuple of arrays, numbers or lists, {merged}make the graph without it."
             if maker
             else "Give arrays, numbers or lists."
         )
@@ -152,6 +163,19 @@ class Source:
 def plain_function(function: Callable[..., Any]) -> FunctionType | None:
     """Return the function of Python that a function of a graph is; None if it is something else."""
     return function if isinstance(function, FunctionType) and not hasattr(function, "__wrapped__") else None
+
+
+def shown_source(function: Callable[..., Any]) -> str:
+    """Return the source of a function, with the short values that it has captured as comments; "" if it has none."""
+    try:
+        text = textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError):
+        return ""
+    captured = inspect.getclosurevars(function).nonlocals if isinstance(function, FunctionType) else {}
+    lines = [f"# {name} = {value!r}" for name, value in captured.items()]
+    # An address would differ at each export.
+    shown = [line for line in lines if len(line) <= _MOST_SHOWN and "\n" not in line and " at 0x" not in line]
+    return "\n".join([*shown, text])
 
 
 def source_of(function: FunctionType) -> Source:

@@ -33,6 +33,8 @@ _STUB: Final = re.compile(
     r"\nnamespace \w+ \{\n\n// By hand: [^\n]*\n(?://[^\n]*\n)*[^\n]*\{\n"
     r"    throw std::logic_error\(\"\w+ is still to be written by hand: [^\n]*\n\}\n\n\}  // namespace \w+\n"
 )
+# What is no code, or may hold a brace that is none: comments, directives, texts and characters.
+_UNREAD: Final = re.compile(r"//[^\n]*|^#[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|'(?:\\.|[^'\\\n])'", flags=re.S | re.M)
 
 
 def write_project(project: Project, folder: Path, *, is_served: bool = False) -> None:
@@ -125,6 +127,7 @@ def _values(project: Project, is_served: bool) -> dict[str, Any]:
         "ns": namespace_of(project),
         "by_hand": BY_HAND,
         "epypes_version": __version__,
+        "opencv_version": recording.opencv_version,
         "is_served": is_served,
         "recording": recording,
         "settings": settings,
@@ -233,25 +236,46 @@ def _write_by_hand(project: Project, path: Path, templates: Environment) -> None
     A function that is still as it was added is no one's work: it goes, or is added anew.
     """
     text = _STUB.sub("", path.read_text("utf-8")) if path.exists() else ""
-    code = re.sub(r"//[^\n]*|^#[^\n]*|/\*.*?\*/", "", text, flags=re.S | re.M)
+    code = _UNREAD.sub("", text)
+    namespace = namespace_of(project)
     added = []
     for each in project.functions:
-        definitions = re.findall(rf"[^;{{}}]*\b{each.name}\s*\([^;{{}}]*\)(?=\s*\{{)", code)
+        pattern = rf"[^;{{}}]*?(?P<space>(?:\w+::)*)\b{each.name}\s*\([^;{{}}]*\)(?=\s*\{{)"
+        definitions = [(_namespace_around(code, found), found[0]) for found in re.finditer(pattern, code)]
         if definitions:
-            each.lines, each.reason = None, each.reason or f"it stands in {BY_HAND}"
             wanted = _types_of(each.signature)
-            if wanted not in map(_types_of, definitions):
-                was = " ".join(definitions[-1].split())
+            spaces = [space for space, head in definitions if _types_of(head) == wanted]
+            if not spaces:
+                was = " ".join(definitions[-1][1].split())
                 each.reason = f"signature of {each.name} has changed: was {was}, is {each.signature}"
                 each.line = ""
+            elif namespace not in spaces:
+                each.reason = f"namespace of {each.name} has changed: was {spaces[-1] or 'none'}, is {namespace}"
+                each.line = ""
+            elif each.is_by_hand:
+                each.reason = f"written in {BY_HAND}: {each.reason}"
+            else:
+                each.reason = f"it stands in {BY_HAND}: delete it there to have it translated"
+            each.lines = None
         elif each.is_by_hand:
             added.append(each)
     template = templates.get_template(BY_HAND)
-    values = {"ns": namespace_of(project), "by_hand": BY_HAND}
+    values = {"ns": namespace, "by_hand": BY_HAND}
     if not added and text in ("", template.render(values, text="", added=[])):
         path.unlink(missing_ok=True)
     else:
         path.write_text(template.render(values, text=text.removesuffix("\n"), added=added), encoding="utf-8")
+
+
+def _namespace_around(code: str, definition: re.Match[str]) -> str:
+    """Return the namespace of a function that is defined in code, by the blocks around it and by its name."""
+    around: list[str] = []
+    for found in re.finditer(r"(?:namespace\s+([\w:]+)\s*)?\{|\}", code[: definition.start("space")]):
+        if found[0] == "}":
+            del around[-1:]
+        else:
+            around.append(found[1] or "")
+    return "::".join(filter(None, (*around, definition["space"].removesuffix("::"))))
 
 
 def _types_of(signature: str) -> tuple[str, ...]:

@@ -68,7 +68,7 @@ def test_a_slider_of_the_exposure_makes_the_picture_brighter_while_it_goes_on(
     notebook: Notebook, panel: PanelOnScreen
 ) -> None:
     wait_for_frames(panel, 3)
-    dark = panel.page.evaluate(BRIGHTNESS)
+    dark = panel.page.wait_for_function(BRIGHTNESS).json_value()
     before = panel.history
     panel.focus("ExposureTimeAbs")
     panel.page.keyboard.press("End")

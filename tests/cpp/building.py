@@ -112,6 +112,8 @@ def replay(export: ep.CppExport, program: Path, *options: str | Path) -> dict[st
     lines: dict[str, list[str]] = {function: [] for function in names.values()}
     compared = set()
     for line in done.stdout.splitlines():
+        if line.startswith("recorded with OpenCV "):
+            continue
         sample, name, rest = line.split(", ", 2)
         compared.add(name)
         if name in names and not rest.endswith(": bit-identical"):

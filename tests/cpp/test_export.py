@@ -33,9 +33,9 @@ def above(pixels, level):
     return pixels > level + LEVEL
 
 
-def bright(blurred, level=100):
+def bright(blurred, level=100, white=255):
     mask = above(blurred, level)
-    return np.uint8(mask) * 255
+    return np.uint8(mask) * white
 
 
 @ep.outputs("area", "rows")
@@ -127,13 +127,39 @@ def test_a_token_without_a_type_in_c_plus_plus_is_named(tmp_path):
     def sizes(image):
         return {"height": image.shape[0]}
 
+    def half(found):
+        return found["height"] // 2
+
     runner = ep.CompGraphRunner(ep.CompGraph({"sizes": sizes}, {"sizes": ("image", "found")}))
     runner.run(image=photograph(3))
     with pytest.raises(BundleError, match="token 'found' are a dict") as refused:
         ep.export_cpp(runner, tmp_path / "cpp")
-    assert "Leave it out of the outputs, or have 'sizes' return a tuple" in str(refused.value)
+    way_out = "Let 'sizes' return a tuple of arrays, numbers or lists, {}make the graph without it."
+    assert way_out.format("") in str(refused.value)
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"sizes": sizes, "half": half}, {"sizes": ("image", "found"), "half": ("found", "middle")})
+    )
+    runner.run(image=photograph(3))
+    with pytest.raises(BundleError) as refused:
+        ep.export_cpp(runner, tmp_path / "cpp", outputs=["middle"])
+    assert way_out.format("merge it with 'half', or ") in str(refused.value)
     # The frames are those of the caller and of the exporting module, none below.
     assert len({frame.filename for frame in traceback.extract_tb(refused.value.__traceback__)}) == 2
+
+
+def test_a_closure_by_hand_has_its_source_and_what_it_has_captured(tmp_path):
+    def above_level(level, table):
+        def chosen(image):
+            return image[image > level], table[:1]
+
+        return chosen
+
+    chosen = above_level(7, np.zeros(200))
+    runner = ep.CompGraphRunner(ep.CompGraph({"chosen": chosen}, {"chosen": ("image", ("pixels", "first"))}))
+    runner.run(image=photograph(3))
+    text = (ep.export_cpp(runner, tmp_path / "cpp").path / "by_hand.cpp").read_text()
+    source = "# level = 7\ndef chosen(image):\n    return image[image > level], table[:1]\n"
+    assert "".join(f"//     {line}\n" for line in source.splitlines()) in text
 
 
 def test_a_state_that_begins_with_an_array_brings_the_header_of_arrays(tmp_path):
@@ -175,15 +201,27 @@ def test_numpy_1_is_refused(bundle, tmp_path, monkeypatch):
         ep.export_cpp(bundle, tmp_path / "cpp")
 
 
-def test_a_function_by_hand_whose_signature_has_changed_is_named(bundle, tmp_path):
+def test_a_function_by_hand_whose_signature_or_namespace_has_changed_is_named(bundle, tmp_path):
     by_hand = ep.export_cpp(bundle, tmp_path / "cpp").path / "by_hand.cpp"
-    head = '#include "graph.hpp"\nnamespace spots {\n'
-    by_hand.write_text(f"{head}double middle(const cv::Mat &image) {{ return image.rows; }}\n}}\n")
-    assert "signature of" not in str(ep.export_cpp(bundle, tmp_path / "cpp"))
+    start = '#include "graph.hpp"\nnamespace helpers { const char* brace = "{"; }\n'
+    head = f"{start}namespace spots {{\n"
+    own = "double middle(const cv::Mat &image) { return image.rows; }\n"
+    for text in (f"{head}{own}}}\n", f"{start}{own.replace('middle', 'spots::middle')}"):
+        by_hand.write_text(text)
+        printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
+        assert "middle                written in by_hand.cpp: np.median has no translation, in: return" in printed
+    # As after the bundle was renamed.
+    for text, was in ((f"{start}namespace dots {{\n{own}}}\n", "dots"), (f"{start}{own}", "none")):
+        by_hand.write_text(text)
+        assert f"namespace of middle has changed: was {was}, is spots" in str(ep.export_cpp(bundle, tmp_path / "cpp"))
+        assert by_hand.read_text() == text
     by_hand.write_text(f"{head}double middle(const cv::Mat &image, int size) {{ return image.rows; }}\n}}\n")
     was, now = "double middle(const cv::Mat &image, int size)", "double middle(const cv::Mat& blurred)"
     printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
     assert f"signature of middle has changed: was {was}, is {now}" in printed
+    by_hand.write_text(f"{head}cv::Mat gray(const cv::Mat& image) {{ return image; }}\n}}\n")
+    printed = str(ep.export_cpp(bundle, tmp_path / "cpp"))
+    assert "it stands in by_hand.cpp: delete it there to have it translated" in printed
 
 
 @pytest.mark.slow
@@ -192,6 +230,11 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
     shutil.copytree(project, folder)
     done = built(folder)
     assert done.returncode == 1
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), photograph(12))
+    refused = run(folder, "spots", photo)
+    text = "middle: middle is still to be written by hand: see by_hand.cpp\n"
+    assert (refused.returncode, refused.stderr) == (1, text)
     lines = done.stdout.splitlines()
     assert "sample 002, steady, steady: bit-identical" in lines
     assert "sample 000, middle, middle is still to be written by hand: see by_hand.cpp" in lines
@@ -211,6 +254,9 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
     assert by_hand.read_text() == wrong
     done = built(folder)
     assert "sample 000, middle, middle: expected 0, got 1.5; 1 differ, by at most 1.5" in done.stdout
+    recorded = f"recorded with OpenCV {cv2.__version__}, this is OpenCV "
+    assert done.stdout.splitlines()[-1].startswith(recorded)
+    assert "recorded with" not in "".join(lines)
     assert done.returncode == 1
     assert run(folder, "replay", "--tolerance", "middle=1").returncode == 1
     done = run(folder, "replay", "--tolerance", "middle=2")
@@ -231,15 +277,20 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
     # Command lines are refused with what there is.
     refused = run(folder, "replay", "--tolerance", "brigth=1")
     assert (refused.returncode, "there are gray, blurred, bright, area, rows" in refused.stderr) == (2, True)
-    photo = tmp_path / "photo.png"
-    for program, *options in (("replay", "--quick", "1"), ("spots", photo, "--levle", "1"), ("spots", photo, photo)):
+    for text, program, *options in (
+        ("there is no option --quick", "replay", "--quick", "1"),
+        ("there is no option --levle", "spots", photo, "--levle"),
+        ("the option --level needs a value", "spots", photo, "--level"),
+        ("there is a second input", "spots", photo, photo),
+    ):
         refused = run(folder, program, *options)
         assert (refused.returncode, f"Usage: {program}" in refused.stderr) == (2, True), refused.stderr
+        assert text in refused.stderr
     for program in ("replay", "spots"):
         assert run(folder, program, "--help").stdout.startswith(f"Usage: {program}")
 
     # The program runs the graph, and refuses a value that is out of its range.
-    cv2.imwrite(str(photo), photograph(12))
+    (tmp_path / "steady.png").touch()  # of an earlier run, in which it was an image
     cv2.imwrite(str(tmp_path / "16 bits.png"), photograph(12).astype(np.uint16) * 256)
     cv2.imwrite(str(tmp_path / "gray.png"), gray(photograph(12)))
     exif = Image.Exif()
@@ -252,8 +303,13 @@ def test_the_project_computes_the_samples_and_keeps_what_is_written_by_hand(bund
         assert shown.returncode == 0, shown.stderr
         expected = bright(blurred(gray(cv2.imread(str(image))), 3), 120)
         assert np.array_equal(cv2.imread(str(tmp_path / "bright.png"), cv2.IMREAD_UNCHANGED), expected), name
+    assert not (tmp_path / "steady.png").exists()
     refused = run(folder, "spots", photo, "--blur_kernel", "4")
     assert (refused.returncode, refused.stderr) == (1, "blur_kernel has to be at least 1 and odd\n")
+    refused = run(folder, "spots", photo, "--white", "256")
+    assert (refused.returncode, refused.stderr) == (1, "bright: integer 256 is out of bounds for uint8\n")
+    refused = run(folder, "spots", photo, "--level", "abc")
+    assert (refused.returncode, refused.stderr) == (1, "--level: 'abc' is no number of this type\n")
 
 
 def run(folder, program, *arguments):

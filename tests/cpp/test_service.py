@@ -268,6 +268,7 @@ def test_parameters_are_set_while_it_runs_and_verify_names_what_differs(bundle, 
     [
         ("blur_kernel=4", "blur_kernel has to be at least 1 and odd"),
         ("canny_lo=1.5", "'canny_lo' is a whole number, and 1.5 is none."),
+        ("canny_lo=99999999999", "is a whole number from -2147483648 to 2147483647, and 99999999999 is none."),
         ("canny_low=1", "No hyperparameter 'canny_low' in this service"),
     ],
 )

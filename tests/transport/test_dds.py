@@ -12,12 +12,18 @@ import threading
 from pathlib import Path
 
 import pytest
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.topic import Topic
 
 import epypes as ep
 from epypes.errors import AddressError, BrokerError, MessageError
 from epypes.optional import NO_WHEEL_FROM
-from epypes.transport.address import open_channel
-from epypes.transport.peers.dds_messages import MessageCodec
+from epypes.transport.address import open_channel, parse_address
+from epypes.transport.channel import ChannelOptions
+from epypes.transport.peers.dds_domain import qos_of
+from epypes.transport.peers.dds_messages import MessageCodec, codec_of
 from tests.transport.channels import Receiver, Sender, join
 from tests.transport.peers import PEER_PUBLISHER, WAIT_S, line_of, process, publish, wait_until
 
@@ -105,6 +111,20 @@ def test_what_is_no_message_of_epypes_is_counted_and_the_next_arrives(started, t
     with ep.Subscriber(f"{place}?durability=transient_local&history=10", arrived) as subscriber:
         assert arrived.get(timeout=WAIT_S) == bytes([1, 2, 3])
         assert subscriber.rejected == {"bad cdr": 1, "bad frames": 1, "bad topic": 1}
+
+
+def test_a_subscriber_has_joined_when_the_publisher_knows_it(topic, place):
+    address = parse_address(place)
+    _, sample_type = codec_of(address, ChannelOptions())
+    with ep.Subscriber(place, queue.SimpleQueue()) as subscriber:
+        participant, qos = DomainParticipant(DOMAIN), qos_of(address, is_reader=False)
+        topics = Topic(participant, topic, sample_type)
+        writer = DataWriter(participant, topics, Qos(Policy.Userdata(b"epypes"), base=qos))
+        wait_until(writer.get_matched_subscriptions)
+        assert not subscriber.wait_joined(0.5), "it matches, and is not in the list of this writer"
+        (reader,) = map(writer.get_matched_subscription_data, writer.get_matched_subscriptions())
+        writer.set_qos(Qos(Policy.Userdata(b"epypes" + reader.key.bytes)))
+        assert subscriber.wait_joined(WAIT_S)
 
 
 def test_a_publisher_that_misses_its_deadline_makes_the_input_stale_until_it_sends(place):

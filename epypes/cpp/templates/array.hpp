@@ -29,7 +29,7 @@ using Shape = std::array<Size, N>;
 /// A view of memory that it shares with other views; a copy of an Array is another view.
 template <class T, int N>
 struct Array {
-    static_assert(std::is_arithmetic_v<T>);
+    static_assert(std::is_arithmetic_v<T>, "the elements of an array are numbers, as in numpy::Array<float, 2>");
     Shape<N> shape{};
     Shape<N> strides{};  // in bytes
     char* data = nullptr;
@@ -243,7 +243,7 @@ Array<T, N> contiguous(const Array<T, N>& array) {
 /// An image as an array that shares its memory; channels are the third dimension.
 template <class T, int N>
 Array<T, N> array(const cv::Mat& image) {
-    static_assert(N == 2 || N == 3);
+    static_assert(N == 2 || N == 3, "a cv::Mat becomes an array of 2 dimensions, or of 3 with its channels");
     // A list of points or lines is a column of several channels; newer versions of OpenCV for Python make rows of it.
     const bool is_list = N == 2 && image.channels() > 1 && image.cols == 1;
     const bool has_rank = (image.channels() == 1) == (N == 2) || is_list;
@@ -287,7 +287,7 @@ bool is_shareable(const Array<T, N>& array) {
 /// An array as an image that shares its memory if it can; one of one dimension is a column.
 template <class T, int N>
 cv::Mat mat(const Array<T, N>& given) {
-    static_assert(N >= 1 && N <= 3);
+    static_assert(N >= 1 && N <= 3, "a cv::Mat is made of an array of 1, 2 or 3 dimensions");
     const Array<T, N> array = is_shareable(given) ? given : copy(given);
     const int channels = N == 3 ? static_cast<int>(array.shape[N - 1]) : 1;
     const int rows = static_cast<int>(array.shape[0]);

@@ -1,6 +1,7 @@
 {% filter wrapped %}
 // @{mark}
 // Runs the graph on one image, or on values in a file of cv::FileStorage, and writes its outputs.
+#include <cstdio>
 #include <cstdlib>
 #include <exception>
 #include <iostream>
@@ -41,19 +42,29 @@ void print_usage(std::ostream& stream) {
     });
 }
 
-/// Changes a hyperparameter by its name; returns whether there is one.
-bool change(@{ns}::Hyperparameters& hyperparameters, const std::string& name, const std::string& value) {
-    bool found = false;
+/// Changes the hyperparameter that has a name.
+void change(@{ns}::Hyperparameters& hyperparameters, const std::string& name, const std::string& value) {
     @{ns}::Hyperparameters::each(hyperparameters, [&](const char* own, auto& member) {
         if (name == own) {
             using T = std::decay_t<decltype(member)>;
             if constexpr (is_plain<T>) {
-                member = values::parse<T>(value);
+                try {
+                    member = values::parse<T>(value);
+                } catch (const std::invalid_argument& error) {
+                    throw std::invalid_argument("--" + name + ": " + error.what());
+                }
             } else {
                 throw std::invalid_argument(name + " can only be changed in the program");
             }
-            found = true;
         }
+    });
+}
+
+bool is_option(const std::string& argument) {
+    bool found = argument == "--out";
+    const @{ns}::Hyperparameters hyperparameters;
+    @{ns}::Hyperparameters::each(hyperparameters, [&](const char* own, const auto&) {
+        found = found || argument == std::string("--") + own;
     });
     return found;
 }
@@ -99,12 +110,14 @@ void write_outputs(const std::string& folder, const @{ns}::Outputs& outputs) {
     }
     @{ns}::Outputs::each(outputs, [&](const char* name, const auto& member) {
         if constexpr (std::is_same_v<std::decay_t<decltype(member)>, cv::Mat>) {
+            const std::string picture = folder + "/" + name + ".png";
             const bool is_image = (member.depth() == CV_8U || member.depth() == CV_16U) && member.channels() != 2;
             if (is_image && member.channels() <= 4 && !member.empty()) {
-                cv::imwrite(folder + "/" + name + ".png", member);
-                std::cout << name << ": " << folder << "/" << name << ".png\n";
+                cv::imwrite(picture, member);
+                std::cout << name << ": " << picture << "\n";
                 return;
             }
+            std::remove(picture.c_str());  // of an earlier run
         }
         file << name;
         values::write_value(file, member);
@@ -129,14 +142,17 @@ int run(int count, char** arguments) {
             input = argument;
             continue;
         }
+        if (!is_option(argument)) {
+            throw UsageError("there is no option " + argument);
+        }
         if (index + 1 == count) {
-            throw UsageError("there is no option " + argument + ", or it needs a value");
+            throw UsageError("the option " + argument + " needs a value");
         }
         const std::string value = arguments[++index];
         if (argument == "--out") {
             folder = value;
-        } else if (argument.rfind("--", 0) != 0 || !change(hyperparameters, argument.substr(2), value)) {
-            throw UsageError("there is no option " + argument);
+        } else {
+            change(hyperparameters, argument.substr(2), value);
         }
     }
     if (input.empty()) {
@@ -145,7 +161,13 @@ int run(int count, char** arguments) {
     @{ns}::Inputs inputs;
     read_inputs(input, inputs);
     @{ns}::Graph graph(hyperparameters);
-    write_outputs(folder, graph.run(inputs));
+    @{ns}::Outputs outputs;
+    try {
+        outputs = graph.run(inputs);
+    } catch (const std::exception& error) {
+        throw std::runtime_error(std::string(@{ns}::Graph::functions[graph.running()]) + ": " + error.what());
+    }
+    write_outputs(folder, outputs);
     for (std::size_t index = 0; index < graph.seconds().size(); ++index) {
         std::cout << @{ns}::Graph::functions[index] << ": " << 1e3 * graph.seconds()[index] << " ms\n";
     }

@@ -92,18 +92,27 @@ inline std::int64_t shift_right(std::int64_t value, std::int64_t count) {
 
 inline std::int64_t absolute(std::int64_t value) { return value < 0 ? subtract(0, value) : value; }
 
+template <class T, class V>
+[[noreturn]] void out_of_bounds(V value) {
+    if constexpr (std::is_same_v<T, std::int64_t>) {
+        overflow();  // Python has integers of any size
+    }
+    const std::string name = (std::is_unsigned_v<T> ? "uint" : "int") + std::to_string(8 * sizeof(T));
+    throw std::overflow_error("integer " + std::to_string(value) + " is out of bounds for " + name);
+}
+
 /// An integer as one of fewer bits; throws if it does not fit.
 template <class T, class V>
 T narrow(V value) {
     if constexpr (std::is_unsigned_v<V>) {
         if (value > static_cast<std::make_unsigned_t<T>>(std::numeric_limits<T>::max())) {
-            overflow();
+            out_of_bounds<T>(value);
         }
     } else {
         if (value < 0 ? std::is_unsigned_v<T> ||
                 value < static_cast<std::int64_t>(std::numeric_limits<T>::min())
                       : static_cast<std::uint64_t>(value) > static_cast<std::uint64_t>(std::numeric_limits<T>::max())) {
-            overflow();
+            out_of_bounds<T>(value);
         }
     }
     return static_cast<T>(value);

@@ -45,6 +45,7 @@ class Report {
             }
             std::cout << "\n";
             ++failed;
+            differs = true;
         } else if (found.tolerated != 0) {
             std::cout << "within the tolerance; " << found.tolerated << " are not bit-identical\n";
         } else {
@@ -58,6 +59,7 @@ class Report {
     }
 
     int failed = 0;
+    bool differs = false;  // whether a value does
 
   private:
     std::string where_;
@@ -195,6 +197,11 @@ int run(int count, char** arguments) {
         std::cerr << "\n";
         return 2;
     }
+{% if opencv_version %}
+    if (report.differs) {
+        std::cout << "recorded with OpenCV @{opencv_version}, this is OpenCV " << CV_VERSION << "\n";
+    }
+{% endif %}
     return report.failed == 0 ? 0 : 1;
 }
 

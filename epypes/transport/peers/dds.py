@@ -2,6 +2,10 @@
 
 A channel has a reader or a writer of one topic; all channels of a process in one domain share its participant.
 
+Joining: a reader may know a writer that does not know it yet, and whose messages it would miss. So a writer lists the
+keys of its readers in its own discovery data, as USER_DATA, and a reader counts the writers that list it. Those of
+other programs list none: they count when they match.
+
 No listener is used: Cyclone would call it on its own threads, under its own locks, and it would wait there for Python's
 lock, which cyclonedds holds while it writes. One thread per channel waits for data and statuses and reads both.
 """
@@ -18,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.core import DDSException, DDSStatus, GuardCondition, WaitSet
 from cyclonedds.pub import DataWriter
-from cyclonedds.qos import Policy
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
@@ -46,6 +50,9 @@ _READER_STATUSES: Final = (
     | DDSStatus.RequestedDeadlineMissed
     | DDSStatus.RequestedIncompatibleQos
 )
+# How USER_DATA begins that lists the readers of a writer, and the bytes of each key.
+_READERS: Final = b"epypes"
+_KEY_BYTES: Final = 16
 _WRITER_STATUSES: Final = DDSStatus.PublicationMatched | DDSStatus.OfferedIncompatibleQos
 # By the number that DDS gives them: what an address says of a policy.
 _POLICIES: Final[Mapping[int, tuple[str, Any]]] = {
@@ -92,7 +99,7 @@ class DDSSession(PeerSession):
             watched = self._reader = DataReader(participant, topic, qos)
             watched.set_status_mask(_READER_STATUSES)
         else:
-            watched = self._writer = DataWriter(participant, topic, qos)
+            watched = self._writer = DataWriter(participant, topic, Qos(Policy.Userdata(_READERS), base=qos))
             watched.set_status_mask(_WRITER_STATUSES)
         others = BuiltinTopicDcpsPublication if is_receiver else BuiltinTopicDcpsSubscription
         self._discovery, self._stop = BuiltinDataReader(participant, others), GuardCondition(participant)
@@ -140,15 +147,15 @@ class DDSSession(PeerSession):
         """Read what has changed: other endpoints, statuses, and data."""
         watched, channel = self._reader or self._writer, self.channel
         statuses = watched.take_status()
-        self._read_discovery()
+        is_discovered = self._read_discovery()
         if statuses & DDSStatus.RequestedIncompatibleQos:
             self._warn_of_policy(watched.get_requested_incompatible_qos_status().last_policy_id)
         if statuses & DDSStatus.OfferedIncompatibleQos:
             self._warn_of_policy(watched.get_offered_incompatible_qos_status().last_policy_id)
         if statuses & DDSStatus.PublicationMatched:
-            channel.subscriptions.set_count(watched.get_publication_matched_status().current_count)
-        if statuses & DDSStatus.SubscriptionMatched:
-            channel.publishers.set_count(watched.get_subscription_matched_status().current_count)
+            self._list_readers()
+        if statuses & DDSStatus.SubscriptionMatched or (is_discovered and self._reader is not None):
+            channel.publishers.set_count(self._writers_that_know())
         if statuses & DDSStatus.LivelinessChanged:
             channel.publishers.set_stale(watched.get_liveliness_changed_status().alive_count == 0)
         if statuses & DDSStatus.RequestedDeadlineMissed:
@@ -175,8 +182,24 @@ class DDSSession(PeerSession):
         else:
             self.channel.deliver(frames, known_as, headers)
 
-    def _read_discovery(self) -> None:
+    def _list_readers(self) -> None:
+        """Count the readers that match the writer, and have it list them."""
+        handles = self._writer.get_matched_subscriptions()
+        found = filter(None, map(self._writer.get_matched_subscription_data, handles))
+        self._writer.set_qos(Qos(Policy.Userdata(b"".join([_READERS, *(reader.key.bytes for reader in found)]))))
+        self.channel.subscriptions.set_count(len(handles))
+
+    def _writers_that_know(self) -> int:
+        """Return how many writers match the reader and list it, or list none."""
+        found = map(self._reader.get_matched_publication_data, self._reader.get_matched_publications())
+        writers = [self._others[writer.key] for writer in found if writer is not None and writer.key in self._others]
+        return sum(_lists(writer.qos, self._reader.guid.bytes) for writer in writers)
+
+    def _read_discovery(self) -> bool:
+        """Take what has changed about other endpoints; return whether something has."""
+        is_changed = False
         while found := self._discovery.take(_BATCH):
+            is_changed = True
             for other in found:
                 if not other.sample_info.valid_data:
                     self._others.pop(other.key, None)
@@ -185,6 +208,7 @@ class DDSSession(PeerSession):
                     if other.type_name != self._type_name:
                         text = "%s: a peer has this topic with the type %s; here it is %s, so the two don't match."
                         log.warning(text, self.address, other.type_name, self._type_name)
+        return is_changed
 
     def _warn_of_policy(self, number: int) -> None:
         """Warn of the policy by which a peer does not match."""
@@ -198,6 +222,13 @@ class DDSSession(PeerSession):
         offers, asks = (theirs, ours) if self._reader is not None else (ours, theirs)
         text = "%s does not match a peer: the publisher offers %s %s, the subscriber asks for %s. Give both the same."
         log.warning(text, self.address, option, offers, asks)
+
+
+def _lists(qos: Any, key: bytes) -> bool:
+    """Whether a writer lists the reader of this key; one of another program lists none."""
+    listed = qos[Policy.Userdata].data if Policy.Userdata in qos else b""
+    keys = (listed[start : start + _KEY_BYTES] for start in range(len(_READERS), len(listed), _KEY_BYTES))
+    return not listed.startswith(_READERS) or key in keys
 
 
 def make_channel(address: Address, options: ChannelOptions) -> PeerChannel:

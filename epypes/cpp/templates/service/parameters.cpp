@@ -1,6 +1,8 @@
 #include "parameters.hpp"
 
+#include <algorithm>
 #include <cmath>
+#include <cstdint>
 #include <limits>
 #include <tuple>
 #include <type_traits>
@@ -10,8 +12,8 @@
 namespace service {
 namespace {
 
-// A double holds every whole number below this one.
-constexpr double most_whole = 9007199254740992.0;
+// A double holds every whole number up to this one.
+constexpr double most_whole = 9007199254740991.0;
 
 std::string brief(const Json& value) {
     const std::string text = value.dump(-1, ' ', false, Json::error_handler_t::replace);
@@ -38,10 +40,14 @@ std::enable_if_t<std::is_arithmetic_v<T>> assign(T& member, const Json& given) {
         member = given.get<T>();
     } else {
         const double number = given.is_number() ? given.get<double>() : std::numeric_limits<double>::quiet_NaN();
-        const bool is_whole = std::trunc(number) == number && std::abs(number) < most_whole;
-        if (!is_whole || number < static_cast<double>(std::numeric_limits<T>::min()) ||
-            number > static_cast<double>(std::numeric_limits<T>::max())) {
+        if (std::trunc(number) != number) {
             refuse(given, "a whole number");
+        }
+        const double low = std::max(static_cast<double>(std::numeric_limits<T>::min()), -most_whole);
+        const double high = std::min(static_cast<double>(std::numeric_limits<T>::max()), most_whole);
+        if (number < low || number > high) {
+            const auto shown = [](double limit) { return std::to_string(static_cast<std::int64_t>(limit)); };
+            refuse(given, ("a whole number from " + shown(low) + " to " + shown(high)).c_str());
         }
         member = static_cast<T>(number);
     }
