@@ -70,15 +70,15 @@ def verify_service(
     samples = sorted((folder / SAMPLES).glob("*.npz"))
     found: list[Difference] = []
     within: dict[str, float] = {}
-    causes: list[str] = []
+    answer: Answer | None = None
     with Client(path, sub=sub, pub=pub, **options) as client:
         for file in samples:
             sample = read_sample(file)
             answer = client.call(sample.inputs)
             tokens = answer.tokens
-            causes = _causes(path, bundle_digest, settings, answer, pub)
             if tokens.keys() != sample.outputs.keys():
                 answered, recorded = (", ".join(names) or "nothing" for names in (tokens, sample.outputs))
+                causes = _causes(path, bundle_digest, settings, answer, pub)
                 text = f"The service at {parse_address(sub)} answers with {answered}, and {path} has recorded"
                 raise ServiceError(path, " ".join([f"{text} {recorded}.", *(causes or ["Does it serve this bundle?"])]))
             for token, expected in sample.outputs.items():
@@ -95,6 +95,7 @@ def verify_service(
     count = len(samples) * len(settings.outputs)
     report = ReplayReport(len(samples), count, tuple(found), environment=environment(), notes=notes)
     if not report.identical:
+        causes = [] if answer is None else _causes(path, bundle_digest, settings, answer, pub)
         raise ReplayDiffers(path, replace(report, causes=causes))
     return report
 

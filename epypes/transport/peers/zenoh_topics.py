@@ -16,6 +16,7 @@ import re
 import time
 import uuid
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import zenoh
@@ -90,7 +91,7 @@ class _RosTopic(ZenohTopic):
             raise AddressError(str(address), f"{name!r} is no name of a ROS 2 topic, in {address}. Write camera/image.")
         if name.startswith("rt/"):
             text = f"{address}: in Zenoh, a topic of ROS 2 has no rt/ before its name"
-            raise AddressError(str(address), f"{text}: write zenoh://{address.host}/{name.removeprefix('rt/')}")
+            raise AddressError(str(address), f"{text}: write {replace(address, name=name.removeprefix('rt/'))}")
         kind = self._codec.type
         self.key = _checked_key(address, f"{self._domain}/{name}/{kind.dds_name}/{kind.rihs01}")
         self.keys = f"{self._domain}/{name}/{kind.dds_name}/*"

@@ -60,7 +60,7 @@ def ranges(runner: Tunable, hints: Mapping[str, Any], settings: Collection[str] 
     for name in hints:
         if name not in values:
             kind, of = ("setting or hyperparameter", "camera or ") if settings else ("hyperparameter", "")
-            raise UnknownName(kind, name, [*settings, *values], f"of this {of}runner")
+            raise UnknownName(kind, name, [*values, *settings], f"of this {of}runner")
     return _ranges(runner, {name: _read(runner, name, hint) for name, hint in hints.items()})
 
 
