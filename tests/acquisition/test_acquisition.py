@@ -20,19 +20,11 @@ import pytest
 import epypes as ep
 from epypes.acquisition import Counts
 from epypes.errors import CameraUnavailable, FrameUnavailable, StillRunning
+from tests.transport.peers import wait_until
 
 
 def gray(value: int) -> np.ndarray:
     return np.full((6, 8), value, np.uint8)
-
-
-def until(condition, timeout_s: float = 60.0) -> None:
-    """Wait until a condition holds."""
-    asking = threading.Event()
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "it never came to that"
-        asking.wait(0.001)
 
 
 class Fed:
@@ -95,7 +87,7 @@ def test_the_pair_closest_to_its_time_stamp_is_found():
         for number, place in enumerate((0, 1, 0, 0, 1, 0, 1, 1, 1), start=1):
             before = frames(acquisition)[place]
             (left, right)[place].items.put(gray(number))
-            until(lambda before=before, place=place: len(acquisition.rings[place]) > before)
+            wait_until(lambda before=before, place=place: len(acquisition.rings[place]) > before)
             times_ns[place].append(acquisition.rings[place].nearest(time.time_ns()).captured_ns)
         for wanted_ns in range(max(times_ns[0][0], times_ns[1][0]), time.time_ns(), 50_000):
             pair = acquisition.nearest(wanted_ns)
@@ -121,14 +113,14 @@ def test_a_camera_that_has_died_never_answers_with_an_old_picture():
     with ep.ImageAcquisition(gray(1), camera, max_age_s=0.5) as acquisition:
         assert acquisition.wait_for_frames(5)
         last_ns = acquisition.nearest(time.time_ns())[1].captured_ns
-        until(lambda: time.time_ns() > last_ns + 500_000_000)
+        wait_until(lambda: time.time_ns() > last_ns + 500_000_000)
         with pytest.raises(FrameUnavailable, match=r"Camera 1 has no frame within 0\.5 s.*Does the camera still run\?"):
             acquisition.nearest(time.time_ns())
 
 
 def test_before_the_first_frame_there_is_none():
     with ep.ImageAcquisition(gray(1), Fed()) as acquisition:
-        until(lambda: frames(acquisition)[0])
+        wait_until(lambda: frames(acquisition)[0])
         now_ns = time.time_ns()
         with pytest.raises(FrameUnavailable, match="Camera 1 has no frame yet"):
             acquisition.nearest(now_ns)
@@ -144,15 +136,15 @@ def test_a_camera_never_waits_for_a_request_and_lets_go_of_old_frames():
         return image
 
     with ep.ImageAcquisition(Fresh(make), size=4) as acquisition:
-        until(lambda: frames(acquisition)[0] > 2_000)
+        wait_until(lambda: frames(acquisition)[0] > 2_000)
         first = newest(acquisition)[0]
         number, image = first.number, weakref.ref(first.image)
         del first
-        until(lambda: frames(acquisition)[0] > number + 100)
+        wait_until(lambda: frames(acquisition)[0] > number + 100)
         assert newest(acquisition)[0].number > number
         assert len(acquisition.rings[0]) == 4
         assert len(alive) < 20
-        until(lambda: image() is None)
+        wait_until(lambda: image() is None)
 
 
 # What is copied
@@ -246,7 +238,7 @@ def test_a_camera_that_gives_nothing_once_is_tried_again(caplog):
     camera = Fed(gray(1), CameraUnavailable("mine", "not now"), gray(2))
     errors = queue.SimpleQueue()
     with ep.ImageAcquisition(camera, on_error=lambda *error: errors.put(error)) as acquisition:
-        until(lambda: frames(acquisition) == [2])
+        wait_until(lambda: frames(acquisition) == [2])
         assert acquisition.counts == (Counts(frames=2, missed=1, failed=0),)
         assert acquisition.states == ("running",)
     assert errors.empty()
@@ -270,7 +262,7 @@ def test_single_misses_add_up_to_no_outage():
     errors = queue.SimpleQueue()
     camera = Fed(*miss, gray(1), *miss, gray(2))
     with ep.ImageAcquisition(camera, on_error=lambda *error: errors.put(error)) as acquisition:
-        until(lambda: frames(acquisition) == [2])
+        wait_until(lambda: frames(acquisition) == [2])
         assert acquisition.counts[0].missed == 8
     assert errors.empty()
 
@@ -282,7 +274,7 @@ def test_a_stream_that_breaks_off_is_opened_again(tmp_path):
         writer.write(np.zeros((48, 64, 3), np.uint8))
     writer.release()
     with ep.ImageAcquisition(f"file://{path}") as acquisition:
-        until(lambda: frames(acquisition)[0] > 6)
+        wait_until(lambda: frames(acquisition)[0] > 6)
         assert acquisition.counts[0].missed >= 6
         assert acquisition.states == ("running",)
 
@@ -290,7 +282,7 @@ def test_a_stream_that_breaks_off_is_opened_again(tmp_path):
 def test_a_video_without_loop_ends(tmp_path):
     images = [gray(1), gray(2), gray(3)]
     with ep.ImageAcquisition(ep.camera(images, fps=math.inf, loop=False), gray(9)) as acquisition:
-        until(lambda: acquisition.states == ("ended", "running") and acquisition.counts[1].frames)
+        wait_until(lambda: acquisition.states == ("ended", "running") and acquisition.counts[1].frames)
         assert acquisition.counts[0] == Counts(frames=3, missed=0, failed=0)
         assert newest(acquisition)[0].number == 3
     assert acquisition.states == ("ended", "stopped")
@@ -317,13 +309,13 @@ def test_a_generator_that_raises_is_reported_with_its_index_and_the_others_go_on
         assert acquisition.states == ("running", "failed")
         assert acquisition.counts[1] == Counts(frames=1, missed=0, failed=1)
         seen = frames(acquisition)[0]
-        until(lambda: frames(acquisition)[0] > seen + 3)
+        wait_until(lambda: frames(acquisition)[0] > seen + 3)
     assert acquisition.states == ("stopped", "failed")
 
 
 def test_a_failure_that_nobody_asks_for_is_logged(caplog):
     with ep.ImageAcquisition(generator_that_raises(ZeroDivisionError("lens cap"))) as acquisition:
-        until(lambda: acquisition.states == ("failed",))
+        wait_until(lambda: acquisition.states == ("failed",))
     (record,) = caplog.records
     assert (record.name, record.levelno) == ("epypes.acquisition", logging.ERROR)
     assert "camera 0: lens cap" in record.getMessage()
@@ -334,7 +326,7 @@ def test_an_on_error_that_fails_itself_harms_nobody(caplog):
         raise RuntimeError("on top of that")
 
     with ep.ImageAcquisition(generator_that_raises(ValueError()), gray(1), on_error=on_error) as acquisition:
-        until(lambda: acquisition.states[0] == "failed")
+        wait_until(lambda: acquisition.states[0] == "failed")
         assert acquisition.wait_for_frames(5)
     assert "on_error itself failed" in caplog.text
 
@@ -350,7 +342,7 @@ def test_a_frame_that_is_no_image_is_named(frame, text):
         index, error = errors.get(timeout=60)
         assert index == 0
         assert re.search(text, str(error))
-        until(lambda: acquisition.states == ("failed",))
+        wait_until(lambda: acquisition.states == ("failed",))
         assert not acquisition.wait_for_frames(3600), "known at once: none will come"
 
 
@@ -444,7 +436,7 @@ def test_many_threads_start_and_stop_at_once():
     assert errors == []
     acquisition.stop()
     assert acquisition.states == ("stopped", "stopped")
-    until(lambda: not [thread for thread in threading.enumerate() if "camera" in thread.name])
+    wait_until(lambda: not [thread for thread in threading.enumerate() if "camera" in thread.name])
 
 
 @pytest.mark.parametrize("close_hangs", [False, True])
@@ -454,7 +446,7 @@ def test_a_camera_whose_read_never_returns_is_named_and_the_others_stop(close_ha
     with pytest.raises(StillRunning, match=r"did not stop within 0\.05 s: still in 'camera 1'") as info:
         acquisition.stop(0.05)
     assert info.value.functions == ("camera 1",)
-    until(lambda: acquisition.states == ("stopped", "running"))
+    wait_until(lambda: acquisition.states == ("stopped", "running"))
     with pytest.raises(StillRunning, match="camera 1"):
         acquisition.start()
     stuck.go.set()

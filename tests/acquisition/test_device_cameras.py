@@ -22,6 +22,7 @@ from epypes.acquisition.pixel_formats import to_image
 from epypes.errors import CameraUnavailable, MissingPackage
 from tests.fake_camera import FakeCamera
 from tests.ipython_cells import run_cells
+from tests.transport.peers import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -49,13 +50,6 @@ def camera(request, fake):
     with ep.camera(request.param) as camera:
         camera.settings.set(**SMALL, AcquisitionFrameRate=100.0, TriggerMode="Off")
         yield camera
-
-
-def until(condition, timeout_s: float = 60.0) -> None:
-    pause, deadline_s = threading.Event(), time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "it never came to that"
-        pause.wait(0.002)
 
 
 # Settings
@@ -107,7 +101,7 @@ def test_a_longer_exposure_makes_brighter_frames(fake):
         camera.settings.set(**SMALL, ExposureTimeAbs=3_000.0)
         dark = camera.read().mean()
         camera.settings["ExposureTimeAbs"] = 30_000.0
-        until(lambda: camera.read().mean() > dark + 50)
+        wait_until(lambda: camera.read().mean() > dark + 50)
 
 
 def test_a_mode_that_another_setting_locks_is_named():
@@ -163,7 +157,7 @@ def test_frames_whose_packets_are_lost_are_counted_and_never_given(fake):
     try:
         with ep.camera(GENICAM) as camera:
             camera.settings["AcquisitionFrameRate"] = 100.0
-            until(lambda: camera.read().shape == (512, 512) and camera.counts.incomplete + camera.counts.lost > 0)
+            wait_until(lambda: camera.read().shape == (512, 512) and camera.counts.incomplete + camera.counts.lost > 0)
     finally:
         fake.kill()
         fake.start()
@@ -371,7 +365,7 @@ def test_a_camera_that_is_unplugged_is_told_and_goes_on_when_it_is_back(fake):
             camera.settings["ExposureTimeAbs"] = 1_000.0
         seen = acquisition.counts[0].frames
         fake.start()
-        until(lambda: acquisition.counts[0].frames > seen)
+        wait_until(lambda: acquisition.counts[0].frames > seen)
         assert acquisition.states == ("running",)
         assert acquisition.nearest(time.time_ns())[0].image.shape == (64, 96)
         assert camera.settings["AcquisitionFrameRate"].value == pytest.approx(100.0)
@@ -381,7 +375,7 @@ def test_a_camera_that_is_unplugged_is_told_and_goes_on_when_it_is_back(fake):
         fake.start()
         _, error = errors.get(timeout=60)
         assert error.is_gone
-        until(lambda: acquisition.states == ("running",))
+        wait_until(lambda: acquisition.states == ("running",))
     assert errors.empty()
     camera.close()
 

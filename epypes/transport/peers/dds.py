@@ -196,15 +196,14 @@ class DDSSession(PeerSession):
         return sum(_lists(writer.qos, self._reader.guid.bytes) for writer in writers)
 
     def _read_discovery(self) -> bool:
-        """Take what has changed about other endpoints; return whether something has."""
+        """Take what has changed about other endpoints; return whether one of this topic has."""
         is_changed = False
         while found := self._discovery.take(_BATCH):
-            is_changed = True
             for other in found:
                 if not other.sample_info.valid_data:
-                    self._others.pop(other.key, None)
+                    is_changed |= self._others.pop(other.key, None) is not None
                 elif other.topic_name == self.address.name:
-                    self._others[other.key] = other
+                    is_changed, self._others[other.key] = True, other
                     if other.type_name != self._type_name:
                         text = "%s: a peer has this topic with the type %s; here it is %s, so the two don't match."
                         log.warning(text, self.address, other.type_name, self._type_name)
